@@ -14610,6 +14610,8 @@ typedef struct gsf__grad_kernels {
     void (*norm)(const gsf__grad_job* job, int64_t row, float* sums, float* products);
     void (*sum)(const gsf__grad_job* job, int64_t row, float* sums, float* products); // of dy, and of dy x unless x is NULL
     void (*scale)(const float* x, const float* y, int64_t count, float* out); // out = x y
+    // y = the sum of weight[k] * row at[k] of x or, with `add`, y += that; x (any, channels)
+    void (*gather)(const int32_t* at, const float* weight, int64_t taps, const float* x, int64_t channels, int add, float* y);
     // Rotates pairs back: dx = dy turned by the negative angles; dx may be dy
     void (*rope)(const float* dy, int64_t count, const float* cos, const float* sin, float* dx);
     // sums[0] += sum of dy, sums[1] += sum of dy (x - mean) inverse
@@ -14788,6 +14790,18 @@ GSF__V_KERNEL void GSF__V(gsf__scale_row)(const float* x, const float* y, int64_
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__gather_row)(const int32_t* at, const float* weight, int64_t taps, const float* x,
+                                           int64_t channels, int add, float* y) {
+    for (int64_t i = 0; i < channels; i += GSF__LANES) {
+        const size_t left = (size_t)(channels - i);
+        gsf__vf sum = gsf__v_set(0.0f);
+        for (int64_t k = 0; k < taps; k++)
+            sum = gsf__v_madd(gsf__v_set(weight[k]), gsf__v_load_first(x + at[k] * channels + i, left), sum);
+        if (add) sum = sum + gsf__v_load_first(y + i, left);
+        gsf__v_store_first(y + i, sum, left);
+    }
+}
+
 GSF__V_KERNEL void GSF__V(gsf__channel_sums)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse,
                                              double* sums) {
     const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
@@ -14893,17 +14907,17 @@ GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int
 static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
     static const gsf__grad_kernels scalar = {
         gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar, gsf__norm_grad_row_scalar,
-        gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__rope_grad_scalar, gsf__channel_sums_scalar,
-        gsf__channel_grad_scalar, gsf__attention_grad_row_scalar};
+        gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__gather_row_scalar, gsf__rope_grad_scalar,
+        gsf__channel_sums_scalar, gsf__channel_grad_scalar, gsf__attention_grad_row_scalar};
 #if GSF__X86
     static const gsf__grad_kernels avx2 = {
         gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2, gsf__norm_grad_row_avx2,
-        gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__rope_grad_avx2, gsf__channel_sums_avx2,
-        gsf__channel_grad_avx2, gsf__attention_grad_row_avx2};
+        gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__gather_row_avx2, gsf__rope_grad_avx2,
+        gsf__channel_sums_avx2, gsf__channel_grad_avx2, gsf__attention_grad_row_avx2};
     static const gsf__grad_kernels avx512 = {
         gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512, gsf__norm_grad_row_avx512,
-        gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__rope_grad_avx512, gsf__channel_sums_avx512,
-        gsf__channel_grad_avx512, gsf__attention_grad_row_avx512};
+        gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__gather_row_avx512, gsf__rope_grad_avx512,
+        gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__attention_grad_row_avx512};
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
@@ -15574,6 +15588,225 @@ GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_gr
         gsf_free(ctx, g.sums);
     }
     return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * g.width, g.layer.out, d->dbias) : GSF_OK;
+}
+
+// ---- training: resampling and warping
+
+/* Layers of image networks, forward and backward; images are channels-last. Resampling and warping are sparse matrices
+   over pixels: an output pixel is a weighted sum of a few input pixels (taps). Backward is the transposed matrix, whose
+   rows list the taps of an input pixel in order of the output pixels, so both directions are the same gathering of rows. */
+typedef struct gsf__nn_sparse { // rows of taps; one allocation, freed with gsf_free(ctx, first)
+    int64_t rows;
+    int64_t* first;   // (rows + 1): of each row, into at and weight
+    int32_t* at;
+    float* weight;
+} gsf__nn_sparse;
+
+typedef struct gsf__nn_taps { gsf__nn_sparse forward, backward; } gsf__nn_taps; // by output pixel; by input pixel
+
+static void gsf__nn_destroy_taps(gsf_context* ctx, gsf__nn_taps* taps) {
+    gsf_free(ctx, taps->forward.first);
+    gsf_free(ctx, taps->backward.first);
+    memset(taps, 0, sizeof *taps);
+}
+
+static gsf_result gsf__nn_make_sparse(gsf_context* ctx, int64_t rows, int64_t count, gsf__nn_sparse* out) {
+    memset(out, 0, sizeof *out);
+    if (rows > INT32_MAX || count > INT64_MAX / 16 || (uint64_t)(rows + 1 + count) > SIZE_MAX / sizeof(int64_t))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "resampling: %lld pixels", (long long)rows);
+    out->first = (int64_t*)gsf_alloc_zeroed(ctx, (size_t)(rows + 1 + count), sizeof(int64_t)); // at and weight: 4 bytes each
+    if (!out->first) return GSF_ERROR_OUT_OF_MEMORY;
+    out->rows = rows;
+    out->at = (int32_t*)(void*)(out->first + rows + 1);
+    out->weight = (float*)(void*)(out->at + count);
+    return GSF_OK;
+}
+
+// Transposes taps->forward, whose columns are `inputs` pixels.
+static gsf_result gsf__nn_transpose_taps(gsf_context* ctx, int64_t inputs, gsf__nn_taps* taps) {
+    const gsf__nn_sparse* f = &taps->forward;
+    gsf__nn_sparse* b = &taps->backward;
+    const int64_t count = f->first[f->rows];
+    GSF__TRY(gsf__nn_make_sparse(ctx, inputs, count, b));
+    for (int64_t k = 0; k < count; k++) b->first[f->at[k] + 1]++;
+    for (int64_t i = 0; i < inputs; i++) b->first[i + 1] += b->first[i];
+    for (int64_t r = 0; r < f->rows; r++)
+        for (int64_t k = f->first[r]; k < f->first[r + 1]; k++) {
+            const int64_t to = b->first[f->at[k]]++; // the start moves to the end: the next row's start
+            b->at[to] = (int32_t)r;
+            b->weight[to] = f->weight[k];
+        }
+    memmove(b->first + 1, b->first, (size_t)inputs * sizeof(int64_t));
+    b->first[0] = 0;
+    return GSF_OK;
+}
+
+typedef struct gsf__nn_grid { int64_t height, width; } gsf__nn_grid; // of an image
+
+// Appends the taps of one output pixel: bilinear at (x, y), pixel centres at integers. Taps outside of the image count as
+// zeros; a position that is not finite has no taps.
+static void gsf__nn_add_taps(gsf__nn_sparse* s, int64_t row, gsf__nn_grid from, float x, float y) {
+    int64_t k = s->first[row];
+    if (x > -1.0f && y > -1.0f && x < (float)from.width && y < (float)from.height) {
+        const float left = floorf(x), top = floorf(y), wx = x - left, wy = y - top;
+        for (int i = 0; i < 4; i++) {
+            const int64_t c = (int64_t)left + i % 2, r = (int64_t)top + i / 2;
+            const float weight = (i % 2 ? wx : 1.0f - wx) * (i / 2 ? wy : 1.0f - wy);
+            if (weight == 0.0f || c < 0 || r < 0 || c >= from.width || r >= from.height) continue;
+            s->at[k] = (int32_t)(r * from.width + c);
+            s->weight[k++] = weight;
+        }
+    }
+    s->first[row + 1] = k;
+}
+
+// Samples an image at `positions`: (to.height, to.width, 2), x then y, in pixels from the centre of the first one.
+// Positions have no gradient.
+GSF__SHARED gsf_result gsf__nn_make_warp(gsf_context* ctx, gsf__nn_grid from, gsf__nn_grid to, const float* positions,
+                                         gsf__nn_taps* out) {
+    const int64_t outputs = to.height * to.width;
+    memset(out, 0, sizeof *out);
+    if (from.height < 1 || from.width < 1 || outputs < 1 || from.height > INT32_MAX / from.width)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warping: %lld x %lld pixels", (long long)from.width,
+                        (long long)from.height);
+    gsf_result result = gsf__nn_make_sparse(ctx, outputs, 4 * outputs, &out->forward);
+    for (int64_t r = 0; !result && r < outputs; r++)
+        gsf__nn_add_taps(&out->forward, r, from, positions[2 * r], positions[2 * r + 1]);
+    if (!result) result = gsf__nn_transpose_taps(ctx, from.height * from.width, out);
+    if (result) gsf__nn_destroy_taps(ctx, out);
+    return result;
+}
+
+static float gsf__nn_resize_position(int64_t i, int64_t from, int64_t to, int bilinear) {
+    const double scale = (double)from / (double)to, at = ((double)i + 0.5) * scale - 0.5, last = (double)(from - 1);
+    if (!bilinear) return (float)(i * from / to);
+    return (float)(at < 0.0 ? 0.0 : at > last ? last : at);
+}
+
+// Resizes an image: nearest, or bilinear without antialiasing (PyTorch's interpolate with align_corners=False).
+GSF__SHARED gsf_result gsf__nn_make_resize(gsf_context* ctx, gsf__nn_grid from, gsf__nn_grid to, int bilinear,
+                                           gsf__nn_taps* out) {
+    memset(out, 0, sizeof *out);
+    if (to.height < 1 || to.width < 1 || to.height > INT32_MAX / to.width || from.height < 1 || from.width < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resampling: %lld x %lld pixels to %lld x %lld",
+                        (long long)from.width, (long long)from.height, (long long)to.width, (long long)to.height);
+    float* positions = (float*)gsf_alloc(ctx, (size_t)(to.height * to.width), 2 * sizeof(float));
+    if (!positions) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t y = 0; y < to.height; y++)
+        for (int64_t x = 0; x < to.width; x++) {
+            positions[2 * (y * to.width + x)] = gsf__nn_resize_position(x, from.width, to.width, bilinear);
+            positions[2 * (y * to.width + x) + 1] = gsf__nn_resize_position(y, from.height, to.height, bilinear);
+        }
+    const gsf_result result = gsf__nn_make_warp(ctx, from, to, positions, out);
+    gsf_free(ctx, positions);
+    return result;
+}
+
+typedef struct gsf__gather_job {
+    const gsf__grad_kernels* kernels;
+    const gsf__nn_sparse* by;
+    const float* x;
+    float* y;
+    int64_t channels, chunk_rows;
+    int add;
+} gsf__gather_job;
+
+static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__gather_job* job = (const gsf__gather_job*)arg;
+    const gsf__nn_sparse* s = job->by;
+    const int64_t begin = (int64_t)chunk * job->chunk_rows, end = gsf__least(begin + job->chunk_rows, s->rows);
+    (void)worker;
+    for (int64_t r = begin; r < end; r++)
+        job->kernels->gather(s->at + s->first[r], s->weight + s->first[r], s->first[r + 1] - s->first[r], job->x,
+                             job->channels, job->add, job->y + r * job->channels);
+}
+
+// y (rows, channels) = by x or, with `add`, y += by x. A layer's forward pass takes taps->forward; its backward pass takes
+// taps->backward, with dy for x and dx for y.
+GSF__SHARED void gsf__nn_gather(gsf_context* ctx, const gsf__nn_sparse* by, const float* x, int64_t channels, int add,
+                                float* y) {
+    gsf__gather_job job = {gsf__grad_kernels_of(ctx->cpu_level), by, x, y, channels, gsf__nn_chunk_rows(4 * channels), add};
+    gsf__parallel_for(ctx, gsf__nn_chunks(by->rows, job.chunk_rows), gsf__gather_chunk, &job);
+}
+
+typedef struct gsf__shuffle_job {
+    const float* from;
+    float* to;
+    int64_t width, channels, factor; // of the coarse image; channels of the fine one
+    int back;
+} gsf__shuffle_job;
+
+static void gsf__shuffle_row(void* arg, size_t row, int32_t worker) { // of the fine image
+    const gsf__shuffle_job* job = (const gsf__shuffle_job*)arg;
+    const int64_t f = job->factor, c = job->channels, y = (int64_t)row / f, inner = (int64_t)row % f * f;
+    (void)worker;
+    for (int64_t x = 0; x < job->width * f; x++)
+        for (int64_t i = 0; i < c; i++) {
+            const int64_t fine = ((int64_t)row * job->width * f + x) * c + i;
+            const int64_t coarse = ((y * job->width + x / f) * c + i) * f * f + inner + x % f;
+            if (job->back) job->to[coarse] = job->from[fine];
+            else job->to[fine] = job->from[coarse];
+        }
+}
+
+// x (rows, width, channels f^2) to y (f rows, f width, channels), channels in PyTorch's order; `back`: from y to x, which
+// is also the backward pass. `rows` may be those of several images.
+GSF__SHARED void gsf__nn_shuffle_pixels(gsf_context* ctx, const float* from, int64_t rows, int64_t width, int64_t channels,
+                                        int64_t factor, int back, float* to) {
+    gsf__shuffle_job job = {from, to, width, channels, factor, back};
+    gsf__parallel_for(ctx, (size_t)(rows * factor), gsf__shuffle_row, &job);
+}
+
+// ---- training: blends of candidates
+
+typedef struct gsf__nn_blend {
+    int64_t pixels, candidates, channels;
+    const float *x, *weights;   // (pixels, candidates, channels); (pixels, candidates): gsf__nn_softmax of the logits
+    float* y;                   // forward: (pixels, channels)
+    const float* dy;            // backward
+    float *dx, *dlogits;        // as x (may be NULL), as weights
+} gsf__nn_blend;
+
+static void gsf__blend_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__nn_blend* b = (const gsf__nn_blend*)arg;
+    const int64_t n = b->candidates, c = b->channels, rows = gsf__nn_chunk_rows(n * c), begin = (int64_t)chunk * rows;
+    (void)worker;
+    for (int64_t p = begin; p < begin + rows && p < b->pixels; p++) {
+        const float *x = b->x + p * n * c, *weight = b->weights + p * n;
+        float* y = b->y + p * c;
+        for (int64_t i = 0; i < c; i++) y[i] = 0.0f;
+        for (int64_t k = 0; k < n; k++)
+            for (int64_t i = 0; i < c; i++) y[i] += weight[k] * x[k * c + i];
+    }
+}
+
+static void gsf__blend_grad_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__nn_blend* b = (const gsf__nn_blend*)arg;
+    const int64_t n = b->candidates, c = b->channels, rows = gsf__nn_chunk_rows(n * c), begin = (int64_t)chunk * rows;
+    (void)worker;
+    for (int64_t p = begin; p < begin + rows && p < b->pixels; p++) {
+        const float *x = b->x + p * n * c, *weight = b->weights + p * n, *dy = b->dy + p * c;
+        float *dlogits = b->dlogits + p * n, mean = 0.0f;
+        for (int64_t k = 0; k < n; k++) {
+            float dot = 0.0f;
+            for (int64_t i = 0; i < c; i++) dot += dy[i] * x[k * c + i];
+            mean += weight[k] * dot;
+            dlogits[k] = dot;
+        }
+        for (int64_t k = 0; k < n; k++) {
+            dlogits[k] = weight[k] * (dlogits[k] - mean);
+            for (int64_t i = 0; b->dx && i < c; i++) b->dx[(p * n + k) * c + i] = weight[k] * dy[i];
+        }
+    }
+}
+
+// y = the sum over a pixel's candidates of weight * x
+GSF__SHARED void gsf__nn_blend_forward(gsf_context* ctx, gsf__nn_blend* b) {
+    gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__blend_chunk, b);
+}
+GSF__SHARED void gsf__nn_blend_backward(gsf_context* ctx, gsf__nn_blend* b) {
+    gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__blend_grad_chunk,
+                      b);
 }
 
 #endif // GSF_NN_TRAINING

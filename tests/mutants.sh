@@ -49,6 +49,8 @@ gsfixer_nn.h|test_nn_gradients|gradients: the rotary embedding turned on instead
 gsfixer_nn.h|test_nn_gradients|gradients: group norm without its slope|s/n\.inverse \* gsf__v_nmadd\(normal, slope, h\)/n.inverse * h/
 gsfixer_nn.h|test_nn_gradients|gradients: convolution kernels not mirrored|s/\+ o\) \* taps \+ gsf__conv_flip\(t, layer->kernel\)/+ o) * taps + t/
 gsfixer_nn.h|test_nn_gradients|gradients: frames before the first get none of a convolution|s/if \(job\.out\) gsf__conv_frame/if (job.out \&\& s >= 0) gsf__conv_frame/
+gsfixer_nn.h|test_nn_gradients|gradients: warping forgets the weights of its taps|s/b->weight\[to\] = f->weight\[k\];/b->weight[to] = 1.0f;/
+gsfixer_nn.h|test_nn_gradients|gradients: the candidates of a blend as if independent|s/dlogits\[k\] = weight\[k\] \* \(dlogits\[k\] - mean\)/dlogits[k] *= weight[k]/
 gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(gsf__v_load_first\(dp \+ j, left\) - less\)/gsf__v_load_first(dp + j, left)/
 END
 }

@@ -1,6 +1,6 @@
 // Gradients of layers over heads, tables and images against central differences of the layers in double: head norm with
-// rotary embedding, gates, embeddings, group norm, convolutions. Odd sizes, all instruction sets, bit-identical for any
-// number of workers. Prints the worst relative L2 error of each layer.
+// rotary embedding, gates, embeddings, group norm, convolutions, resampling, warping, pixel shuffle, blends. Odd sizes, all
+// instruction sets, bit-identical for any number of workers. Prints the worst relative L2 error of each layer.
 #define GSF_NN_TRAINING
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -260,6 +260,141 @@ static void test_convolution(gsf_context* ctx) {
     }
 }
 
+// ---- resampling: size: height, width, new height, new width, channels. option 0: nearest, 1: bilinear, 2: warp by
+// `cos`. p: x. Forward results are compared, too.
+
+static double pixel(const layer* l, const double* p, double x, double y, int64_t c, int zeros) { // bilinear
+    const int64_t h = l->size[0], w = l->size[1], channels = l->size[4];
+    const double left = floor(x), top = floor(y);
+    double sum = 0.0;
+    for (int i = 0; i < 4; i++) {
+        double px = left + i % 2, py = top + i / 2;
+        const double weight = (i % 2 ? x - left : 1.0 - x + left) * (i / 2 ? y - top : 1.0 - y + top);
+        if (zeros && (px < 0 || py < 0 || px >= (double)w || py >= (double)h)) continue;
+        px = fmin(fmax(px, 0.0), (double)(w - 1));
+        py = fmin(fmax(py, 0.0), (double)(h - 1));
+        sum += weight * p[((int64_t)py * w + (int64_t)px) * channels + c];
+    }
+    return sum;
+}
+
+static void resample_forward(const layer* l, const double* p, double* y) {
+    const int64_t h = l->size[0], w = l->size[1], nh = l->size[2], nw = l->size[3], channels = l->size[4];
+    for (int64_t i = 0; i < l->outs; i++) {
+        const int64_t to = i / channels, ty = to / nw, tx = to % nw, c = i % channels;
+        if (l->option == 0) y[i] = p[(ty * h / nh * w + tx * w / nw) * channels + c];
+        else if (l->option == 2) {
+            const double x = (double)l->cos[2 * to], v = (double)l->cos[2 * to + 1];
+            y[i] = fabs(x) < 1e6 && fabs(v) < 1e6 ? pixel(l, p, x, v, c, 1) : 0.0;
+        } else y[i] = pixel(l, p, fmax(((double)tx + 0.5) * (double)w / (double)nw - 0.5, 0.0),
+                            fmax(((double)ty + 0.5) * (double)h / (double)nh - 0.5, 0.0), c, 0);
+    }
+}
+
+static gsf_result resample_backward(gsf_context* ctx, const layer* l, const float* p, const float* dy, float* grad) {
+    const gsf__nn_grid from = {l->size[0], l->size[1]}, to = {l->size[2], l->size[3]};
+    gsf__nn_taps taps;
+    if (l->option == 2) GSF__TRY(gsf__nn_make_warp(ctx, from, to, l->cos, &taps));
+    else GSF__TRY(gsf__nn_make_resize(ctx, from, to, l->option, &taps));
+    float* y = (float*)malloc((size_t)l->outs * sizeof(float));
+    double* wide = (double*)malloc((size_t)(l->outs + l->params) * sizeof(double));
+    gsf__nn_gather(ctx, &taps.forward, p, l->size[4], 0, y);
+    for (int64_t i = 0; i < l->params; i++) wide[l->outs + i] = (double)p[i];
+    resample_forward(l, wide + l->outs, wide);
+    test_compare_floats(l->name, y, wide, (size_t)l->outs, 2e-5);
+    gsf__nn_gather(ctx, &taps.backward, dy, l->size[4], 1, grad); // added to zeros
+    gsf__nn_destroy_taps(ctx, &taps);
+    free(y);
+    free(wide);
+    return GSF_OK;
+}
+
+static void test_resampling(gsf_context* ctx) {
+    static const int64_t sizes[][5] = {{1, 1, 3, 2, 1}, {3, 5, 6, 10, 9}, {7, 4, 5, 9, 17}, {8, 9, 4, 3, 3}, {5, 6, 5, 6, 8}};
+    static const char* const names[] = {"nearest", "bilinear", "warp"};
+    for (size_t i = 0; i < 3 * GSF__COUNT(sizes); i++) {
+        layer l = {names[i % 3], resample_forward, resample_backward, 0, 0, {0}, (int)(i % 3), NULL, NULL, NULL};
+        memcpy(l.size, sizes[i / 3], sizeof sizes[0]);
+        l.params = l.size[0] * l.size[1] * l.size[4];
+        l.outs = l.size[2] * l.size[3] * l.size[4];
+        const int64_t positions = 2 * l.size[2] * l.size[3];
+        l.cos = (float*)malloc((size_t)positions * sizeof(float));
+        for (int64_t k = 0; k < positions; k++) // also outside of the image, and on pixels
+            l.cos[k] = (float)test_random_in(&seed, -2.5, (double)l.size[k % 2 ? 0 : 1] + 1.5);
+        l.cos[0] = 0.0f;
+        l.cos[positions - 1] = NAN;
+        check(ctx, &l);
+        free(l.cos);
+    }
+}
+
+// ---- pixel shuffle: size: rows, width, channels, factor. p: x
+
+static void shuffle_forward(const layer* l, const double* p, double* y) { // y[c][f y + i][f x + j] = x[(c f + i) f + j][y][x]
+    const int64_t rows = l->size[0], w = l->size[1], channels = l->size[2], f = l->size[3];
+    for (int64_t r = 0; r < rows * f; r++)
+        for (int64_t x = 0; x < w * f; x++)
+            for (int64_t c = 0; c < channels; c++)
+                y[(r * w * f + x) * channels + c] = p[(r / f * w + x / f) * channels * f * f + (c * f + r % f) * f + x % f];
+}
+
+static gsf_result shuffle_backward(gsf_context* ctx, const layer* l, const float* p, const float* dy, float* grad) {
+    const int64_t* s = l->size;
+    float* again = (float*)malloc((size_t)(2 * l->params) * sizeof(float));
+    gsf__nn_shuffle_pixels(ctx, p, s[0], s[1], s[2], s[3], 0, again);
+    gsf__nn_shuffle_pixels(ctx, again, s[0], s[1], s[2], s[3], 1, again + l->params);
+    CHECK(memcmp(again + l->params, p, (size_t)l->params * sizeof(float)) == 0);
+    free(again);
+    gsf__nn_shuffle_pixels(ctx, dy, s[0], s[1], s[2], s[3], 1, grad);
+    return GSF_OK;
+}
+
+// ---- blends: size: pixels, candidates, channels. p: logits | x
+
+static void blend_forward(const layer* l, const double* p, double* y) {
+    const int64_t n = l->size[1], c = l->size[2];
+    const double* x = p + l->size[0] * n;
+    for (int64_t i = 0; i < l->outs; i++) {
+        double sum = 0.0, total = 0.0;
+        for (int64_t k = 0; k < n; k++) {
+            const double weight = exp(p[i / c * n + k]);
+            sum += weight;
+            total += weight * x[(i / c * n + k) * c + i % c];
+        }
+        y[i] = total / sum;
+    }
+}
+
+static gsf_result blend_backward(gsf_context* ctx, const layer* l, const float* p, const float* dy, float* grad) {
+    const int64_t logits = l->size[0] * l->size[1];
+    float *weights = (float*)malloc((size_t)logits * sizeof(float)), *y = (float*)malloc((size_t)l->outs * sizeof(float));
+    double* wide = (double*)malloc((size_t)(l->outs + l->params) * sizeof(double));
+    gsf__nn_blend b = {l->size[0], l->size[1], l->size[2], p + logits, weights, y, dy, grad + logits, grad};
+    gsf__nn_softmax(ctx, p, l->size[0], l->size[1], 1.0f, weights);
+    gsf__nn_blend_forward(ctx, &b);
+    for (int64_t i = 0; i < l->params; i++) wide[l->outs + i] = (double)p[i];
+    blend_forward(l, wide + l->outs, wide);
+    test_compare_floats("blend", y, wide, (size_t)l->outs, 2e-6);
+    gsf__nn_blend_backward(ctx, &b);
+    free(weights);
+    free(y);
+    free(wide);
+    return GSF_OK;
+}
+
+static void test_blends(gsf_context* ctx) {
+    static const int64_t sizes[][4] = {{1, 1, 1, 1}, {3, 5, 2, 2}, {7, 8, 3, 3}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        const int64_t *s = sizes[i], count = s[0] * s[1] * s[2] * s[3] * s[3];
+        layer shuffle = {"pixel shuffle", shuffle_forward, shuffle_backward, count, count, {s[0], s[1], s[2], s[3]}, 0, NULL,
+                         NULL, NULL};
+        check(ctx, &shuffle);
+        layer blend = {"blend", blend_forward, blend_backward, s[0] * s[1] * (s[2] + 1), s[0] * s[2], {s[0], s[1], s[2]}, 0,
+                       NULL, NULL, NULL};
+        check(ctx, &blend);
+    }
+}
+
 int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
@@ -273,6 +408,8 @@ int main(void) {
         test_gates_and_tables(&ctx);
         test_group_norm(&ctx);
         test_convolution(&ctx);
+        test_resampling(&ctx);
+        test_blends(&ctx);
     }
     worst_of(NULL, 0.0);
     return test_report();
