@@ -59,8 +59,8 @@
 
    WHERE TO ADD
        a regulariser    its weight: a field of gsf_train_desc and a row of gsf__train_fields; a default other than zero
-                        in gsf__train_desc_defaults, for few views in gsf_splat_resolve_few_view_desc. For `gsfix fix`: `settings` and --regularize in
-                        examples/gsfix_fix.c, `switches` in examples/gsfix_report.c.
+                        in gsf__train_desc_defaults, for few views in gsf_splat_resolve_few_view_desc. For `gsfix fix`:
+                        `settings` and --regularize in examples/gsfix_fix.c, `switches` in examples/gsfix_report.c.
                         On parameters: gsf__penalty_job and gsf__penalty_chunk in >>trainer, and in gsf__trainer_update
                         the condition under which they run. With lazy_adam, they must not write gradients of SH.
                         On the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass. Terms are
@@ -376,6 +376,7 @@ typedef struct gsf_dense {
     uint8_t* view_counts;    // (count) views that agree, at least 2
     size_t map_count;
     gsf_dense_map* maps;     // NULL unless want_maps
+    void* owned;             // memory of all arrays
 } gsf_dense;
 
 // Views are indices into scene->views, whose images must be loaded (pixels with a weight below 128 neither yield nor
@@ -4339,6 +4340,11 @@ static void gsf__knn_build_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
+static int gsf__point_counts(const double* points, const uint8_t* keep, size_t i) { // kept, and finite
+    const double* p = points + 3 * i;
+    return (!keep || keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
+}
+
 // Builds a tree of those of the `count` points (stride 3) whose byte in `keep` is not zero (NULL: all). Points with a
 // non-finite coordinate are skipped; tree->count is the number of points in the tree. Free tree->arena, also after an error.
 static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t count, const uint8_t* keep,
@@ -4348,19 +4354,15 @@ static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t 
     if ((uint64_t)count >= UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "points: %zu do not fit 32-bit indices", count);
     size_t n = 0;
-    for (size_t i = 0; i < count; i++) {
-        const double* p = points + 3 * i;
-        n += (!keep || keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
-    }
+    for (size_t i = 0; i < count; i++) n += (size_t)gsf__point_counts(points, keep, i);
     while (n >> tree->levels > GSF__KNN_LEAF) tree->levels++;
     tree->points = (double*)gsf__arena_alloc(&tree->arena, n, 3 * sizeof(double));
     tree->rows = (uint32_t*)gsf__arena_alloc(&tree->arena, n, sizeof(uint32_t));
     tree->boxes = (double*)gsf__arena_alloc(&tree->arena, (size_t)2 << tree->levels, 6 * sizeof(double));
     if (tree->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < count; i++) {
-        const double* p = points + 3 * i;
-        if (!((!keep || keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]))) continue;
-        memcpy(tree->points + 3 * tree->count, p, 3 * sizeof(double));
+        if (!gsf__point_counts(points, keep, i)) continue;
+        memcpy(tree->points + 3 * tree->count, points + 3 * i, 3 * sizeof(double));
         tree->rows[tree->count++] = (uint32_t)i;
     }
     if (n == 0) return GSF_OK;
@@ -5571,7 +5573,10 @@ typedef float (*gsf__dense_cost_fn)(const gsf__dense_window* window, const gsf__
 
 typedef struct gsf__dense_block { uint32_t view; int32_t row; } gsf__dense_block;
 
-typedef struct gsf__dense_job {
+typedef struct gsf__dense_job gsf__dense_job;
+typedef void (*gsf__dense_pixel_fn)(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y);
+
+struct gsf__dense_job {
     gsf_context* ctx;
     gsf__arena level_arena;        // the arrays of the level, except its planes, which the finer level starts from
     const gsf_scene* scene;
@@ -5597,7 +5602,22 @@ typedef struct gsf__dense_job {
     float step_pixels, step_normal; // size of the perturbations: depth, in source-view pixels; unit normal
     float min_normal_dot;          // minimum dot product of normals that count as consistent
     int32_t roam;                  // also try random planes from the whole depth range
-} gsf__dense_job;
+    gsf__dense_pixel_fn pixel_fn;  // of gsf__dense_run
+};
+
+static void gsf__dense_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    const gsf__dense_job* job = (const gsf__dense_job*)arg;
+    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
+    const int first = job->blocks[chunk].row;
+    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
+        for (int x = 0; x < view->width; x++) job->pixel_fn(job, view, x, y);
+}
+
+static void gsf__dense_run(gsf__dense_job* job, gsf__dense_pixel_fn pixel_fn) { // for all pixels of all views
+    job->pixel_fn = pixel_fn;
+    gsf__parallel_for(job->ctx, job->block_count, gsf__dense_chunk, job);
+}
 
 static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
     gsf_dense_desc d;
@@ -6040,6 +6060,7 @@ static void gsf__dense_refine(const gsf__dense_pixel* p, gsf__dense_plane* best,
 }
 
 static void gsf__dense_visit(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
+    if (((x + y) & 1) != job->color) return;
     const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
     gsf__dense_pixel p;
     if (!gsf__dense_begin(&p, job, view, x, y)) return;
@@ -6072,65 +6093,49 @@ static void gsf__dense_visit(const gsf__dense_job* job, const gsf__dense_view* v
     memcpy(own, costs[best], sizeof costs[0]);
 }
 
-static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int32_t worker) {
-    (void)worker;
-    const gsf__dense_job* job = (const gsf__dense_job*)arg;
-    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
-    const int first = job->blocks[chunk].row;
-    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
-        for (int x = (y + job->color) & 1; x < view->width; x += 2) gsf__dense_visit(job, view, x, y);
-}
-
 // Initial planes: upsampled from the coarser level, or random ones, most of them near the depth of the sparse points.
-static void gsf__dense_start_chunk(void* arg, size_t chunk, int32_t worker) {
-    (void)worker;
-    const gsf__dense_job* job = (const gsf__dense_job*)arg;
-    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
-    const int first = job->blocks[chunk].row;
+static void gsf__dense_start(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
     const uint64_t stream = gsf__dense_stream(job, view);
-    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
-        for (int x = 0; x < view->width; x++) {
-            const size_t pixel = (size_t)y * (size_t)view->width + (size_t)x, at = view->first + pixel;
-            gsf__dense_plane plane;
-            float* costs = job->source_costs + GSF__DENSE_SOURCES * at;
-            gsf__dense_pixel p;
-            int valid = 0;
-            if (job->coarse_planes) {
-                const gsf__dense_view* coarse = job->coarse_views + job->blocks[chunk].view;
-                const float sx = (float)coarse->width / (float)view->width;
-                const float sy = (float)coarse->height / (float)view->height;
-                const float u = ((float)x + 0.5f) * sx - 0.5f, v = ((float)y + 0.5f) * sy - 0.5f;
-                const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
-                plane = job->coarse_planes[coarse->first + (size_t)iv * (size_t)coarse->width + (size_t)iu];
-                plane.w += plane.gx * (u - (float)iu) + plane.gy * (v - (float)iv);
-                plane.gx *= sx;
-                plane.gy *= sy;
-                valid = gsf__dense_plane_valid(view, x, y, &plane);
-            }
-            for (uint64_t attempt = 0; !valid && attempt < 8; attempt++) {
-                float r[4], n[3];
-                gsf__dense_random(job->desc.seed, stream, 8 * (uint64_t)pixel + attempt, r);
-                const float seed = job->seeds ? job->seeds[at] : 0.0f, spread = 0.5f * (view->w_max - view->w_min);
-                float w = view->w_min + spread * (r[3] + 1.0f);
-                if (seed > 0.0f && r[2] > -0.5f) w = seed * (1.0f + 0.05f * r[3]); // in three of four attempts
-                n[0] = r[0] + ((float)x - view->cx) / view->fx;
-                n[1] = r[1] + ((float)y - view->cy) / view->fy;
-                n[2] = 1.0f;
-                valid = gsf__dense_plane_of(view, x, y, w, n, &plane);
-            }
-            if (!valid) {
-                plane.w = 0.5f * (view->w_min + view->w_max);
-                plane.gx = plane.gy = 0.0f;
-            }
-            for (int s = 0; s < GSF__DENSE_SOURCES; s++) costs[s] = GSF__DENSE_BAD;
-            plane.cost = GSF__DENSE_BAD;
-            if (gsf__dense_begin(&p, job, view, x, y)) {
-                for (int s = 0; s < view->source_count; s++) costs[s] = gsf__dense_cost(&p, s, &plane);
-                gsf__dense_weigh(&p, (float(*)[GSF__DENSE_SOURCES])(void*)costs, 1);
-                plane.cost = gsf__dense_mean(&p, costs);
-            }
-            job->planes[at] = plane;
-        }
+    const size_t pixel = (size_t)y * (size_t)view->width + (size_t)x, at = view->first + pixel;
+    gsf__dense_plane plane;
+    float* costs = job->source_costs + GSF__DENSE_SOURCES * at;
+    gsf__dense_pixel p;
+    int valid = 0;
+    if (job->coarse_planes) {
+        const gsf__dense_view* coarse = job->coarse_views + (view - job->views);
+        const float sx = (float)coarse->width / (float)view->width;
+        const float sy = (float)coarse->height / (float)view->height;
+        const float u = ((float)x + 0.5f) * sx - 0.5f, v = ((float)y + 0.5f) * sy - 0.5f;
+        const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
+        plane = job->coarse_planes[coarse->first + (size_t)iv * (size_t)coarse->width + (size_t)iu];
+        plane.w += plane.gx * (u - (float)iu) + plane.gy * (v - (float)iv);
+        plane.gx *= sx;
+        plane.gy *= sy;
+        valid = gsf__dense_plane_valid(view, x, y, &plane);
+    }
+    for (uint64_t attempt = 0; !valid && attempt < 8; attempt++) {
+        float r[4], n[3];
+        gsf__dense_random(job->desc.seed, stream, 8 * (uint64_t)pixel + attempt, r);
+        const float seed = job->seeds ? job->seeds[at] : 0.0f, spread = 0.5f * (view->w_max - view->w_min);
+        float w = view->w_min + spread * (r[3] + 1.0f);
+        if (seed > 0.0f && r[2] > -0.5f) w = seed * (1.0f + 0.05f * r[3]); // in three of four attempts
+        n[0] = r[0] + ((float)x - view->cx) / view->fx;
+        n[1] = r[1] + ((float)y - view->cy) / view->fy;
+        n[2] = 1.0f;
+        valid = gsf__dense_plane_of(view, x, y, w, n, &plane);
+    }
+    if (!valid) {
+        plane.w = 0.5f * (view->w_min + view->w_max);
+        plane.gx = plane.gy = 0.0f;
+    }
+    for (int s = 0; s < GSF__DENSE_SOURCES; s++) costs[s] = GSF__DENSE_BAD;
+    plane.cost = GSF__DENSE_BAD;
+    if (gsf__dense_begin(&p, job, view, x, y)) {
+        for (int s = 0; s < view->source_count; s++) costs[s] = gsf__dense_cost(&p, s, &plane);
+        gsf__dense_weigh(&p, (float(*)[GSF__DENSE_SOURCES])(void*)costs, 1);
+        plane.cost = gsf__dense_mean(&p, costs);
+    }
+    job->planes[at] = plane;
 }
 
 // ---- which views to compare, and how
@@ -6147,8 +6152,7 @@ static int gsf__dense_in_view(const gsf_camera* camera, const double point[3], d
 }
 
 static int gsf__dense_usable(const gsf__dense_job* job, size_t i) {
-    const double* p = job->scene->points + 3 * i;
-    return (!job->keep || job->keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
+    return gsf__point_counts(job->scene->points, job->keep, i);
 }
 
 // Depth range of a view: from 0.7 times the 2nd to 1.4 times the 98th percentile of the depths of its sparse points.
@@ -6459,7 +6463,7 @@ static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int fines
         if (job->step_pixels < 0.1f) job->step_pixels = 0.1f;
         if (job->step_normal < 0.05f) job->step_normal = 0.05f;
         for (job->color = 0; job->color < 2; job->color++)
-            gsf__parallel_for(job->ctx, job->block_count, gsf__dense_sweep_chunk, job);
+            gsf__dense_run(job, gsf__dense_visit);
         *done += (double)job->pixel_count;
         gsf__progress(job->ctx, "stereo", *done < total ? *done : total, total);
     }
@@ -6486,7 +6490,7 @@ static gsf_result gsf__dense_match(gsf__dense_job* job, int32_t levels) {
         job->coarse_planes = coarse_planes;
         job->iteration = -1;
         result = gsf__dense_begin_level(job, level, !coarse_planes);
-        if (result == GSF_OK) gsf__parallel_for(job->ctx, job->block_count, gsf__dense_start_chunk, job);
+        if (result == GSF_OK) gsf__dense_run(job, gsf__dense_start);
         gsf_free(job->ctx, coarse_planes);
         job->coarse_planes = NULL;
         if (result == GSF_OK) result = gsf__dense_sweeps(job, level == levels - 1, level == 0, &done, total);
@@ -6532,28 +6536,21 @@ static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view
     return dot >= job->min_normal_dot;
 }
 
-static void gsf__dense_link_chunk(void* arg, size_t chunk, int32_t worker) {
-    (void)worker;
-    const gsf__dense_job* job = (const gsf__dense_job*)arg;
-    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
-    const int first = job->blocks[chunk].row;
-    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
-        for (int x = 0; x < view->width; x++) {
-            const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
-            const float cost = job->planes[at].cost;
-            int links = 0, good_links = 0, count = 0, good = 0;
-            for (int s = 0; s < view->source_count && cost <= job->desc.max_cost_many; s++) {
-                size_t pixel;
-                if (!gsf__dense_confirmed(job, view, x, y, s, &pixel)) continue;
-                links |= 1 << s;
-                count++;
-                if (!(cost <= job->desc.max_cost && job->planes[pixel].cost <= job->desc.max_cost)) continue;
-                good_links |= 1 << s;
-                good++;
-            }
-            if (count <= job->desc.min_consistent) links = good >= job->desc.min_consistent ? good_links : 0;
-            job->links[at] = (uint8_t)links;
-        }
+static void gsf__dense_link(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
+    const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
+    const float cost = job->planes[at].cost;
+    int links = 0, good_links = 0, count = 0, good = 0;
+    for (int s = 0; s < view->source_count && cost <= job->desc.max_cost_many; s++) {
+        size_t pixel;
+        if (!gsf__dense_confirmed(job, view, x, y, s, &pixel)) continue;
+        links |= 1 << s;
+        count++;
+        if (!(cost <= job->desc.max_cost && job->planes[pixel].cost <= job->desc.max_cost)) continue;
+        good_links |= 1 << s;
+        good++;
+    }
+    if (count <= job->desc.min_consistent) links = good >= job->desc.min_consistent ? good_links : 0;
+    job->links[at] = (uint8_t)links;
 }
 
 static const gsf__dense_view* gsf__dense_view_of(const gsf__dense_job* job, size_t pixel, int* x, int* y) {
@@ -6661,9 +6658,8 @@ static void gsf__dense_merge(const gsf__dense_job* job, size_t pixel, gsf_dense*
     out->view_counts[row] = (uint8_t)count;
 }
 
-static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf_dense* out) {
-    gsf_context* ctx = job->ctx;
-    out->maps = (gsf_dense_map*)gsf_alloc_zeroed(ctx, job->view_count, sizeof(gsf_dense_map));
+static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf__arena* arena, gsf_dense* out) {
+    out->maps = (gsf_dense_map*)gsf__arena_alloc_zeroed(arena, job->view_count, sizeof(gsf_dense_map));
     if (!out->maps) return GSF_ERROR_OUT_OF_MEMORY;
     out->map_count = job->view_count;
     for (size_t i = 0; i < job->view_count; i++) {
@@ -6672,9 +6668,9 @@ static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf_dense* out
         gsf_dense_map* map = out->maps + i;
         map->view = view->index;
         map->camera = view->camera;
-        map->depth = (float*)gsf_alloc_zeroed(ctx, pixels, sizeof(float));
-        map->normals = (float*)gsf_alloc_zeroed(ctx, pixels, 3 * sizeof(float));
-        if (!map->depth || !map->normals) return GSF_ERROR_OUT_OF_MEMORY;
+        map->depth = (float*)gsf__arena_alloc_zeroed(arena, pixels, sizeof(float));
+        map->normals = (float*)gsf__arena_alloc_zeroed(arena, pixels, 3 * sizeof(float));
+        if (arena->failed) return GSF_ERROR_OUT_OF_MEMORY;
         for (size_t k = 0; k < pixels; k++) {
             double point[3], normal[3];
             if (!job->links[view->first + k]) continue;
@@ -6696,15 +6692,14 @@ static void gsf__dense_hide(gsf__dense_job* job) {
     }
 }
 
-static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense_stats* stats) {
+static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf__arena* arena, gsf_dense* out, gsf_dense_stats* stats) {
     enum { BINS = 64 };
-    gsf_context* ctx = job->ctx;
     size_t starts[BINS + 1], count = 0, n = 0;
     job->links = (uint8_t*)gsf__arena_alloc(&job->level_arena, job->pixel_count, 1);
     if (!job->links) return GSF_ERROR_OUT_OF_MEMORY;
     job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
     gsf__dense_hide(job);
-    gsf__parallel_for(ctx, job->block_count, gsf__dense_link_chunk, job);
+    gsf__dense_run(job, gsf__dense_link);
     memset(starts, 0, sizeof starts);
     for (size_t i = 0; i < job->pixel_count; i++) {
         const float cost = job->planes[i].cost;
@@ -6728,16 +6723,15 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     while (job->desc.max_points && n > job->desc.max_points && stats->spacing < 1024)
         n = gsf__dense_thin(job, order, count, ++stats->spacing, covered, chosen);
     if (job->desc.max_points && n > job->desc.max_points) n = job->desc.max_points;
-    out->points = (double*)gsf_alloc(ctx, n ? n : 1, 3 * sizeof(double));
-    out->normals = (float*)gsf_alloc(ctx, n ? n : 1, 3 * sizeof(float));
-    out->colors = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 3);
-    out->confidence = (float*)gsf_alloc(ctx, n ? n : 1, sizeof(float));
-    out->view_counts = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 1);
-    if (!out->points || !out->normals || !out->colors || !out->confidence || !out->view_counts)
-        return GSF_ERROR_OUT_OF_MEMORY;
+    out->points = (double*)gsf__arena_alloc(arena, n, 3 * sizeof(double));
+    out->normals = (float*)gsf__arena_alloc(arena, n, 3 * sizeof(float));
+    out->colors = (uint8_t*)gsf__arena_alloc(arena, n, 3);
+    out->confidence = (float*)gsf__arena_alloc(arena, n, sizeof(float));
+    out->view_counts = (uint8_t*)gsf__arena_alloc(arena, n, 1);
+    if (arena->failed) return GSF_ERROR_OUT_OF_MEMORY;
     out->count = n;
     for (size_t i = 0; i < n; i++) gsf__dense_merge(job, chosen[i], out, i);
-    return job->desc.want_maps ? gsf__dense_make_maps(job, out) : GSF_OK;
+    return job->desc.want_maps ? gsf__dense_make_maps(job, arena, out) : GSF_OK;
 }
 
 // Removes duplicates from the list of views and finds the depth range and the sources of each. *pairs: number of (view,
@@ -6772,16 +6766,8 @@ static gsf_result gsf__dense_prepare(gsf__dense_job* job, const uint32_t* views,
 }
 
 GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense) {
-    for (size_t i = 0; i < dense->map_count; i++) {
-        gsf_free(ctx, dense->maps[i].depth);
-        gsf_free(ctx, dense->maps[i].normals);
-    }
-    gsf_free(ctx, dense->maps);
-    gsf_free(ctx, dense->points);
-    gsf_free(ctx, dense->normals);
-    gsf_free(ctx, dense->colors);
-    gsf_free(ctx, dense->confidence);
-    gsf_free(ctx, dense->view_counts);
+    gsf__arena arena = {ctx, dense->owned, 0};
+    gsf__arena_free(&arena);
     memset(dense, 0, sizeof *dense);
 }
 
@@ -6820,7 +6806,9 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     if (result == GSF_OK && counted.pairs) result = gsf__dense_match(job, levels);
     counted.seconds_match = gsf__vis_seconds() - start;
     start += counted.seconds_match;
-    if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, out, &counted);
+    gsf__arena arena = {ctx, NULL, 0};
+    if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, &arena, out, &counted);
+    out->owned = arena.last;
     counted.seconds_fuse = gsf__vis_seconds() - start;
     if (result == GSF_OK && !counted.pairs)
         gsf_log(ctx, GSF_LOG_WARNING, "dense points: none, because no two of the %zu views overlap", job->view_count);
