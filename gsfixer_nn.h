@@ -62,7 +62,7 @@
                networks   >>nn image encoders >>nn bpe >>nn captioner >>nn tokenizer >>nn t5 >>nn vae >>nn transformer
                restoring  >>nn scheduler >>nn sampling >>nn restorer
                measuring  >>nn metrics
-               training   >>nn training: gradients of layers, compiled with GSF_NN_TRAINING only
+               training   >>nn training: gradients of layers and of the transformer, AdamW; with GSF_NN_TRAINING only
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -12304,20 +12304,24 @@ static size_t gsf__dit_lay_out(gsf__dit_run* run, float* memory) {
     return arena.used;
 }
 
+static gsf_result gsf__dit_make_rope(gsf__dit_run* run) {
+    const gsf_nn_transformer* c = run->net;
+    gsf__nn_rope_desc rope;
+    if (!run->cos) return GSF_OK;
+    memset(&rope, 0, sizeof rope);
+    rope.frames = run->in->frames;
+    rope.height = run->in->height / c->patch;
+    rope.width = run->in->width / c->patch;
+    rope.base_height = c->sample_height / c->patch;
+    rope.base_width = c->sample_width / c->patch;
+    rope.head_dim = c->head_dim;
+    return gsf__nn_make_rope(run->nn.ctx, &rope, run->cos, run->sin);
+}
+
 static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
     const gsf_nn_transformer* c = run->net;
     const gsf_nn_transformer_desc* in = run->in;
-    if (run->cos) {
-        gsf__nn_rope_desc rope;
-        memset(&rope, 0, sizeof rope);
-        rope.frames = in->frames;
-        rope.height = in->height / c->patch;
-        rope.width = in->width / c->patch;
-        rope.base_height = c->sample_height / c->patch;
-        rope.base_width = c->sample_width / c->patch;
-        rope.head_dim = c->head_dim;
-        GSF__TRY(gsf__nn_make_rope(run->nn.ctx, &rope, run->cos, run->sin));
-    }
+    GSF__TRY(gsf__dit_make_rope(run));
     GSF__TRY(gsf__dit_embed_time(run));
     GSF__TRY(gsf__dit_embed(run));
     if (in->references)
@@ -14603,6 +14607,10 @@ typedef struct gsf__grad_job {
     int centre, accumulate;
 } gsf__grad_job;
 
+typedef struct gsf__adam_terms { // of one update; rest: 1 - beta; root: 1 / sqrt of the second moment's bias
+    float scale, beta1, beta2, rest1, rest2, decay, rate, root, eps, average;
+} gsf__adam_terms;
+
 typedef struct gsf__grad_kernels {
     void (*multiply)(const gsf__grad_product* p);
     void (*activate)(gsf__nn_activation activation, const float* x, const float* dy, int64_t count, float* dx);
@@ -14618,6 +14626,8 @@ typedef struct gsf__grad_kernels {
     void (*channel_sums)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse, double* sums);
     // dx = inverse (weight dy - mean - normalised x * slope); by: weight, mean, slope
     void (*channel)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse, const float* by, float* dx);
+    // Updates m, v, value and, unless NULL, average; grad = 0
+    void (*adam)(const gsf__adam_terms* terms, int64_t count, float* grad, float* m, float* v, float* value, float* average);
     // Turns logits into weights p = 2^(factor logit - lse) and dp into scale p (dp - delta)
     void (*attention)(float* logits, float* dp, int64_t count, float factor, float scale, float lse, float delta);
 } gsf__grad_kernels;
@@ -14802,6 +14812,28 @@ GSF__V_KERNEL void GSF__V(gsf__gather_row)(const int32_t* at, const float* weigh
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__adam)(const gsf__adam_terms* terms, int64_t count, float* grad, float* m, float* v,
+                                     float* value, float* average) {
+    const gsf__vf beta1 = gsf__v_set(terms->beta1), beta2 = gsf__v_set(terms->beta2), rate = gsf__v_set(terms->rate);
+    const gsf__vf rest1 = gsf__v_set(terms->rest1), rest2 = gsf__v_set(terms->rest2), root = gsf__v_set(terms->root);
+    const gsf__vf decay = gsf__v_set(terms->decay), eps = gsf__v_set(terms->eps), blend = gsf__v_set(terms->average);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf g = gsf__v_set(terms->scale) * gsf__v_load_first(grad + i, left);
+        const gsf__vf m1 = gsf__v_madd(beta1, gsf__v_load_first(m + i, left), rest1 * g);
+        const gsf__vf v1 = gsf__v_madd(beta2, gsf__v_load_first(v + i, left), rest2 * (g * g));
+        const gsf__vf move = rate * m1 / gsf__v_madd(gsf__v_sqrt(v1), root, eps);
+        const gsf__vf x = gsf__v_msub(decay, gsf__v_load_first(value + i, left), move);
+        gsf__v_store_first(m + i, m1, left);
+        gsf__v_store_first(v + i, v1, left);
+        gsf__v_store_first(value + i, x, left);
+        gsf__v_store_first(grad + i, gsf__v_set(0.0f), left);
+        if (!average) continue;
+        const gsf__vf before = gsf__v_load_first(average + i, left);
+        gsf__v_store_first(average + i, gsf__v_madd(blend, x - before, before), left);
+    }
+}
+
 GSF__V_KERNEL void GSF__V(gsf__channel_sums)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse,
                                              double* sums) {
     const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
@@ -14908,16 +14940,16 @@ static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
     static const gsf__grad_kernels scalar = {
         gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar, gsf__norm_grad_row_scalar,
         gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__gather_row_scalar, gsf__rope_grad_scalar,
-        gsf__channel_sums_scalar, gsf__channel_grad_scalar, gsf__attention_grad_row_scalar};
+        gsf__channel_sums_scalar, gsf__channel_grad_scalar, gsf__adam_scalar, gsf__attention_grad_row_scalar};
 #if GSF__X86
     static const gsf__grad_kernels avx2 = {
         gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2, gsf__norm_grad_row_avx2,
         gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__gather_row_avx2, gsf__rope_grad_avx2,
-        gsf__channel_sums_avx2, gsf__channel_grad_avx2, gsf__attention_grad_row_avx2};
+        gsf__channel_sums_avx2, gsf__channel_grad_avx2, gsf__adam_avx2, gsf__attention_grad_row_avx2};
     static const gsf__grad_kernels avx512 = {
         gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512, gsf__norm_grad_row_avx512,
         gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__gather_row_avx512, gsf__rope_grad_avx512,
-        gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__attention_grad_row_avx512};
+        gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__adam_avx512, gsf__attention_grad_row_avx512};
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
@@ -15807,6 +15839,587 @@ GSF__SHARED void gsf__nn_blend_forward(gsf_context* ctx, gsf__nn_blend* b) {
 GSF__SHARED void gsf__nn_blend_backward(gsf_context* ctx, gsf__nn_blend* b) {
     gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__blend_grad_chunk,
                       b);
+}
+
+// ---- training: parameters and AdamW
+
+typedef struct gsf__nn_params { // the trained tensors of a network in float32; destroy them before the network
+    gsf_nn_weights* weights;
+    gsf_nn_tensor* stored;      // the network's tensors as they were in the file
+    int64_t* at;                // per tensor: offset of its values below; -1: not trained
+    int64_t count, step;        // values; updates done
+    float *value, *grad, *m, *v; // (count); value: what the network computes with; m, v: Adam's moments
+    float* average;             // (count): moving average of the values; NULL: none
+} gsf__nn_params;
+
+static void gsf__nn_destroy_params(gsf_context* ctx, gsf__nn_params* params) {
+    if (params->stored)
+        memcpy(params->weights->tensors, params->stored, params->weights->tensor_count * sizeof *params->stored);
+    gsf_free(ctx, params->stored);
+    gsf_free(ctx, params->at);
+    gsf_free(ctx, params->value);
+    memset(params, 0, sizeof *params);
+}
+
+// Makes a network compute with float32 copies of the tensors that `trains` accepts by name (NULL: all).
+GSF__SHARED gsf_result gsf__nn_make_params(gsf_context* ctx, gsf_nn_weights* weights, int (*trains)(const char* name),
+                                           int average, gsf__nn_params* out) {
+    const size_t tensors = weights->tensor_count;
+    memset(out, 0, sizeof *out);
+    out->weights = weights;
+    out->at = (int64_t*)gsf_alloc(ctx, tensors, sizeof *out->at);
+    if (!out->at) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < tensors; i++) {
+        out->at[i] = !trains || trains(weights->tensors[i].name) ? out->count : -1;
+        if (out->at[i] >= 0) out->count += weights->tensors[i].count;
+    }
+    out->value = (float*)gsf_alloc_zeroed(ctx, (size_t)out->count, (average ? 5 : 4) * sizeof(float));
+    gsf_nn_tensor* stored = out->value ? (gsf_nn_tensor*)gsf_alloc(ctx, tensors, sizeof *stored) : NULL;
+    if (!stored) {
+        gsf__nn_destroy_params(ctx, out);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    memcpy(stored, weights->tensors, tensors * sizeof *stored);
+    out->stored = stored;
+    out->grad = out->value + out->count;
+    out->m = out->grad + out->count;
+    out->v = out->m + out->count;
+    out->average = average ? out->v + out->count : NULL;
+    for (size_t i = 0; i < tensors; i++) {
+        if (out->at[i] < 0) continue;
+        gsf_nn_convert_tensor(&stored[i], 0, stored[i].count, out->value + out->at[i]);
+        weights->tensors[i].data = out->value + out->at[i];
+        weights->tensors[i].dtype = GSF_NN_F32;
+    }
+    if (average) memcpy(out->average, out->value, (size_t)out->count * sizeof(float));
+    return GSF_OK;
+}
+
+// Where to add the gradient of a tensor; NULL if there is no such tensor or it is not trained.
+static float* gsf__nn_grad_of(const gsf__nn_params* params, const gsf_nn_tensor* tensor) {
+    const int64_t at = tensor ? params->at[tensor - params->weights->tensors] : -1;
+    return at < 0 ? NULL : params->grad + at;
+}
+
+typedef struct gsf__nn_adam_desc { // zero is the default
+    double lr;                // 0: 2e-5, the paper's
+    double beta1, beta2, eps; // 0: 0.9, 0.999, 1e-8
+    double weight_decay;      // decoupled (Loshchilov and Hutter 2019)
+    double max_norm;          // of all gradients together, which are scaled down to it; 0: any
+    double average;           // decay of the moving average, as 0.9999
+    int64_t warmup;           // steps in which the rate rises, from 0 in the first one
+    int64_t steps;            // step at which the rate, falling as half a cosine from the warm-up on, is 0; 0: constant
+    int64_t batches;          // whose gradients have been added up, to take their mean; 0: 1
+} gsf__nn_adam_desc;
+
+static double gsf__nn_adam_rate(const gsf__nn_adam_desc* d, int64_t step) { // step counts from 0
+    const double lr = d->lr != 0.0 ? d->lr : 2e-5;
+    if (step < d->warmup) return lr * (double)step / (double)d->warmup;
+    if (!d->steps) return lr;
+    if (step >= d->steps) return 0.0;
+    return lr * 0.5 * (1.0 + cos(3.141592653589793 * (double)(step - d->warmup) / (double)(d->steps - d->warmup)));
+}
+
+typedef struct gsf__adam_job {
+    const gsf__grad_kernels* kernels;
+    const gsf__norm_kernels* norms;
+    gsf__nn_params* params;
+    gsf__adam_terms terms;
+    int64_t part;             // values per part
+    double squares[GSF__GRAD_PARTS];
+} gsf__adam_job;
+
+static void gsf__adam_square_part(void* arg, size_t part, int32_t worker) {
+    gsf__adam_job* job = (gsf__adam_job*)arg;
+    const int64_t begin = (int64_t)part * job->part, count = gsf__least(job->part, job->params->count - begin);
+    (void)worker;
+    job->squares[part] = job->norms->moments(job->params->grad + begin, count, 0).square;
+}
+
+static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__adam_job* job = (const gsf__adam_job*)arg;
+    const gsf__nn_params* p = job->params;
+    const int64_t at = (int64_t)chunk * GSF__NN_CHUNK, count = gsf__least(GSF__NN_CHUNK, p->count - at);
+    (void)worker;
+    job->kernels->adam(&job->terms, count, p->grad + at, p->m + at, p->v + at, p->value + at,
+                       p->average ? p->average + at : NULL);
+}
+
+// One update by AdamW, then the gradients are zero. norm (may be NULL) receives the gradients' before clipping; if it is not
+// finite, nothing is updated.
+GSF__SHARED gsf_result gsf__nn_step_adam(gsf_context* ctx, gsf__nn_params* params, const gsf__nn_adam_desc* d, double* norm) {
+    const double beta1 = d->beta1 != 0.0 ? d->beta1 : 0.9, beta2 = d->beta2 != 0.0 ? d->beta2 : 0.999;
+    const double mean = d->batches > 1 ? 1.0 / (double)d->batches : 1.0, rate = gsf__nn_adam_rate(d, params->step);
+    gsf__adam_job job;
+    double square = 0.0;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+    job.norms = gsf__norm_kernels_of(ctx->cpu_level);
+    job.params = params;
+    job.part = gsf__ceil_div(params->count, GSF__GRAD_PARTS);
+    const size_t parts = gsf__nn_chunks(params->count, job.part > 0 ? job.part : 1);
+    gsf__parallel_for(ctx, parts, gsf__adam_square_part, &job);
+    for (size_t i = 0; i < parts; i++) square += job.squares[i];
+    const double size = sqrt(square) * mean;
+    if (norm) *norm = size;
+    if (!(size <= DBL_MAX))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "training: gradients of step %lld are not finite", (long long)params->step);
+    const double clip = d->max_norm != 0.0 && size + 1e-6 > d->max_norm ? d->max_norm / (size + 1e-6) : 1.0; // as PyTorch
+    const double t = (double)++params->step;
+    job.terms.scale = (float)(mean * clip);
+    job.terms.beta1 = (float)beta1;
+    job.terms.beta2 = (float)beta2;
+    job.terms.rest1 = (float)(1.0 - beta1);
+    job.terms.rest2 = (float)(1.0 - beta2);
+    job.terms.decay = (float)(1.0 - rate * d->weight_decay);
+    job.terms.rate = (float)(rate / (1.0 - pow(beta1, t)));
+    job.terms.root = (float)(1.0 / sqrt(1.0 - pow(beta2, t)));
+    job.terms.eps = (float)(d->eps != 0.0 ? d->eps : 1e-8);
+    job.terms.average = (float)(1.0 - d->average);
+    gsf__parallel_for(ctx, gsf__nn_chunks(params->count, GSF__NN_CHUNK), gsf__adam_chunk, &job);
+    return GSF_OK;
+}
+
+// ---- training: the transformer
+
+/* Gradients of gsf_nn_run_transformer, one sample at a time. The forward pass keeps the input of every block; the backward
+   pass runs a block again, keeping its intermediates, and then backwards. So the memory is that of one block plus one
+   (tokens, width) per block. Names: d* is the gradient of *. */
+
+typedef struct gsf__dit_trace { // intermediates of one block; (tokens, width) unless noted, q, k: before their norms
+    float *m1, *m2;                        // (6 width): modulation
+    float *n1, *q, *k, *v, *qn, *kn, *attended, *b1, *x1; // b1: the attention's result before the gate
+    float *nc, *cq, *ck, *cv, *cqn, *ckn, *looked; // cross attention: of video, ck, cv, ckn: (reference tokens, width)
+    float *n2, *up, *hidden, *b2, *x2;      // up, hidden: (tokens, 4 width)
+    float *lse, *cross_lse;                 // (heads, tokens), (heads, video)
+} gsf__dit_trace;
+
+typedef struct gsf__dit_train {
+    gsf__dit_run run;          // of one sample
+    gsf__nn_params* params;
+    const float *dino, *vggt;  // the sample's reference tokens, before the projection
+    float* inputs;             // (layers + 1, tokens, width): x before each block and after the last
+    float* references;         // (reference tokens, width)
+    gsf__dit_trace kept;
+    float *dx, *dn, *db, *dq, *dk, *dv; // (rows, width), rows: the larger of tokens and reference tokens
+    float *dhidden;            // (tokens, 4 width)
+    float *dm, *dtime, *dreferences;
+    float* patches;            // (video, outputs or inputs of a token)
+    float* out;                // predicted velocity, then the noisy input with control, then the true velocity
+    float *wave, *time1, *time2, *hidden_time; // of the time embedding; time1, time2: before the activations
+} gsf__dit_train;
+
+static gsf_result gsf__dit_linear_grad(const gsf__dit_train* t, const gsf__nn_layer* layer, const float* x, int64_t rows,
+                                       const float* dy, float* dx, int accumulate) {
+    gsf__nn_linear_grad_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.weight = layer->weight;
+    d.dy = dy;
+    d.dx = dx;
+    d.accumulate = accumulate;
+    d.dweight = gsf__nn_grad_of(t->params, layer->weight);
+    d.dbias = gsf__nn_grad_of(t->params, layer->bias);
+    return dx || d.dweight || d.dbias ? gsf__nn_linear_grad(t->run.nn.ctx, &d) : GSF_OK;
+}
+
+// scale, dscale, dshift NULL: a norm without modulation
+static gsf_result gsf__dit_norm_grad(gsf__dit_train* t, const gsf__nn_layer* layer, float eps, const float* x, int64_t rows,
+                                     const float* scale, float* dscale, float* dshift, const float* dy, float* dx,
+                                     int accumulate) {
+    const gsf__nn_vectors v = gsf__nn_widen_layer(&t->run.nn, layer);
+    gsf__nn_norm_grad_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.dim = t->run.width;
+    d.by.weight = v.weight;
+    d.by.bias = v.bias;
+    d.by.scale = scale;
+    d.eps = eps;
+    d.dy = dy;
+    d.dx = dx;
+    d.accumulate = accumulate;
+    d.dweight = gsf__nn_grad_of(t->params, layer->weight);
+    d.dbias = gsf__nn_grad_of(t->params, layer->bias);
+    d.dscale = dscale;
+    d.dshift = dshift;
+    return gsf__nn_norm_grad(t->run.nn.ctx, &d);
+}
+
+static gsf_result gsf__dit_head_grad(gsf__dit_train* t, const gsf__nn_layer* norm, int rotate, const float* x, int64_t rows,
+                                     float* dx) { // in place
+    const gsf_nn_transformer* c = t->run.net;
+    const gsf__nn_vectors v = gsf__nn_widen_layer(&t->run.nn, norm);
+    const gsf__nn_head_grad_desc d = {
+        x, rows, rotate ? t->run.text : 0, c->heads, c->head_dim, v.weight, rotate ? t->run.cos : NULL,
+        rotate ? t->run.sin : NULL, 1e-6f, dx, dx, gsf__nn_grad_of(t->params, norm->weight),
+        gsf__nn_grad_of(t->params, norm->bias)};
+    return gsf__nn_head_grad(t->run.nn.ctx, &d);
+}
+
+static gsf__nn_attention_desc gsf__dit_attention_of(const gsf__dit_run* run, int64_t queries, int64_t keys, const float* q,
+                                                    const float* k, const float* v, float* out, float* lse) {
+    gsf__nn_attention_desc a;
+    memset(&a, 0, sizeof a);
+    a.queries = queries;
+    a.keys = keys;
+    a.heads = run->net->heads;
+    a.head_dim = run->net->head_dim;
+    a.q = q;
+    a.k = k;
+    a.v = v;
+    a.out = out;
+    a.lse = lse;
+    return a;
+}
+
+// ---- transformer: a block again, keeping its intermediates
+
+static gsf_result gsf__dit_trace_modulated(gsf__dit_train* t, const gsf__dit_norm* norm, float* x, float* m, float* n) {
+    gsf__dit_run* run = &t->run;
+    float* const before = run->x;
+    run->x = x; // normalises to run->normed
+    const gsf_result result = gsf__dit_modulate(run, "", 0, norm);
+    run->x = before;
+    memcpy(m, run->modulation, (size_t)(6 * run->width) * sizeof(float));
+    memcpy(n, run->normed, (size_t)(run->tokens * run->width) * sizeof(float));
+    return result;
+}
+
+// Linear layers and head norms of q or k.
+static gsf_result gsf__dit_trace_projected(gsf__dit_train* t, const gsf__nn_layer* layer, const gsf__nn_layer* norm, int rotate,
+                                          const float* x, int64_t rows, float* y, float* yn) {
+    GSF__TRY(gsf__dit_linear(&t->run, layer, x, rows, y));
+    memcpy(yn, y, (size_t)(rows * t->run.width) * sizeof(float));
+    gsf__dit_norm_heads(&t->run, norm, rotate, yn, rows);
+    return GSF_OK;
+}
+
+// y = x + gate * b, with the gates of the text and video tokens
+static void gsf__dit_add_gated(const gsf__dit_run* run, const float* x, const float* m, const float* b, float* y) {
+    const int64_t d = run->width;
+    for (int64_t r = 0; r < run->tokens; r++) {
+        const float* gate = m + (r < run->text ? GSF__DIT_TEXT_GATE : GSF__DIT_VIDEO_GATE) * d;
+        for (int64_t i = 0; i < d; i++) y[r * d + i] = x[r * d + i] + gate[i] * b[r * d + i];
+    }
+}
+
+static gsf_result gsf__dit_trace_block(gsf__dit_train* t, const gsf__dit_block* block, float* x) {
+    gsf__dit_run* run = &t->run;
+    gsf__dit_trace* s = &t->kept;
+    gsf_context* ctx = run->nn.ctx;
+    const int64_t n = run->tokens, d = run->width, text = run->text * d, r = run->in->reference_tokens;
+    gsf__nn_attention_desc a = gsf__dit_attention_of(run, n, n, s->qn, s->kn, s->v, s->attended, s->lse);
+    GSF__TRY(gsf__dit_trace_modulated(t, &block->norm1, x, s->m1, s->n1));
+    GSF__TRY(gsf__dit_trace_projected(t, &block->self.q, &block->self.norm_q, 1, s->n1, n, s->q, s->qn));
+    GSF__TRY(gsf__dit_trace_projected(t, &block->self.k, &block->self.norm_k, 1, s->n1, n, s->k, s->kn));
+    GSF__TRY(gsf__dit_linear(run, &block->self.v, s->n1, n, s->v));
+    GSF__TRY(gsf__nn_run_attention(ctx, &run->nn.workspace, &a));
+    GSF__TRY(gsf__dit_linear(run, &block->self.out, s->attended, n, s->b1));
+    gsf__dit_add_gated(run, x, s->m1, s->b1, s->x1);
+    memcpy(s->x2, s->x1, (size_t)(n * d) * sizeof(float));
+    if (r > 0) {
+        a = gsf__dit_attention_of(run, run->video, r, s->cqn, s->ckn, s->cv, s->looked, s->cross_lse);
+        gsf__nn_norm(&run->nn, &block->norm_cross, (float)run->net->norm_eps, s->x1 + text, run->video, s->nc);
+        GSF__TRY(gsf__dit_trace_projected(t, &block->cross.q, &block->cross.norm_q, 0, s->nc, run->video, s->cq, s->cqn));
+        GSF__TRY(gsf__dit_trace_projected(t, &block->cross.k, &block->cross.norm_k, 0, t->references, r, s->ck, s->ckn));
+        GSF__TRY(gsf__dit_linear(run, &block->cross.v, t->references, r, s->cv));
+        GSF__TRY(gsf__nn_run_attention(ctx, &run->nn.workspace, &a));
+        GSF__TRY(gsf__nn_add(&run->nn, &block->cross.out, NULL, s->looked, run->video, s->x2 + text));
+    }
+    GSF__TRY(gsf__dit_trace_modulated(t, &block->norm2, s->x2, s->m2, s->n2));
+    GSF__TRY(gsf__dit_linear(run, &block->up, s->n2, n, s->up));
+    gsf__nn_activate(ctx, GSF__NN_GELU_TANH, s->up, 4 * n * d, s->hidden);
+    return gsf__dit_linear(run, &block->down, s->hidden, n, s->b2);
+}
+
+// ---- transformer: backwards
+
+// x3 = x + gate * b: db = gate * dx; adds to the gates' gradients.
+static gsf_result gsf__dit_gates_grad(gsf__dit_train* t, const float* m, const float* b) {
+    const gsf__dit_run* run = &t->run;
+    const int64_t d = run->width, at = run->text * d;
+    GSF__TRY(gsf__nn_gate_grad(run->nn.ctx, m + GSF__DIT_TEXT_GATE * d, b, t->dx, run->text, d, t->db,
+                               t->dm + GSF__DIT_TEXT_GATE * d));
+    return gsf__nn_gate_grad(run->nn.ctx, m + GSF__DIT_VIDEO_GATE * d, b + at, t->dx + at, run->video, d, t->db + at,
+                             t->dm + GSF__DIT_VIDEO_GATE * d);
+}
+
+// dx += the gradient of the modulated norm of x; then that of the modulation, of which t->dm has the gates already.
+static gsf_result gsf__dit_modulate_grad(gsf__dit_train* t, const gsf__dit_norm* norm, const float* x, const float* m) {
+    const gsf__dit_run* run = &t->run;
+    const int64_t d = run->width, at = run->text * d;
+    const float eps = (float)run->net->norm_eps;
+    float* dm = t->dm;
+    GSF__TRY(gsf__dit_norm_grad(t, &norm->norm, eps, x, run->text, m + 4 * d, dm + 4 * d, dm + 3 * d, t->dn, t->dx, 1));
+    GSF__TRY(gsf__dit_norm_grad(t, &norm->norm, eps, x + at, run->video, m + d, dm + d, dm, t->dn + at, t->dx + at, 1));
+    return gsf__dit_linear_grad(t, &norm->linear, run->time, 1, dm, t->dtime, 1);
+}
+
+static gsf_result gsf__dit_attention_grad(gsf__dit_train* t, const gsf__nn_attention_desc* a, const float* dy) {
+    const gsf__nn_attention_grad_desc d = {a, dy, t->dq, t->dk, t->dv};
+    return gsf__nn_attention_grad(t->run.nn.ctx, &d);
+}
+
+static gsf_result gsf__dit_block_backward(gsf__dit_train* t, const gsf__dit_block* block, const float* x) {
+    const gsf__dit_run* run = &t->run;
+    const gsf__dit_trace* s = &t->kept;
+    const int64_t n = run->tokens, d = run->width, text = run->text * d, r = run->in->reference_tokens;
+    memset(t->dm, 0, (size_t)(6 * d) * sizeof(float));
+    GSF__TRY(gsf__dit_gates_grad(t, s->m2, s->b2));
+    GSF__TRY(gsf__dit_linear_grad(t, &block->down, s->hidden, n, t->db, t->dhidden, 0));
+    gsf__nn_activate_grad(run->nn.ctx, GSF__NN_GELU_TANH, s->up, t->dhidden, 4 * n * d, t->dhidden);
+    GSF__TRY(gsf__dit_linear_grad(t, &block->up, s->n2, n, t->dhidden, t->dn, 0));
+    GSF__TRY(gsf__dit_modulate_grad(t, &block->norm2, s->x2, s->m2));
+    if (r > 0) {
+        const gsf__nn_attention_desc a =
+            gsf__dit_attention_of(run, run->video, r, s->cqn, s->ckn, s->cv, s->looked, s->cross_lse);
+        GSF__TRY(gsf__dit_linear_grad(t, &block->cross.out, s->looked, run->video, t->dx + text, t->db, 0));
+        GSF__TRY(gsf__dit_attention_grad(t, &a, t->db));
+        GSF__TRY(gsf__dit_head_grad(t, &block->cross.norm_q, 0, s->cq, run->video, t->dq));
+        GSF__TRY(gsf__dit_head_grad(t, &block->cross.norm_k, 0, s->ck, r, t->dk));
+        GSF__TRY(gsf__dit_linear_grad(t, &block->cross.q, s->nc, run->video, t->dq, t->dn, 0));
+        GSF__TRY(gsf__dit_linear_grad(t, &block->cross.k, t->references, r, t->dk, t->dreferences, 1));
+        GSF__TRY(gsf__dit_linear_grad(t, &block->cross.v, t->references, r, t->dv, t->dreferences, 1));
+        GSF__TRY(gsf__dit_norm_grad(t, &block->norm_cross, (float)run->net->norm_eps, s->x1 + text, run->video, NULL, NULL,
+                                    NULL, t->dn, t->dx + text, 1));
+    }
+    const gsf__nn_attention_desc a = gsf__dit_attention_of(run, n, n, s->qn, s->kn, s->v, s->attended, s->lse);
+    memset(t->dm, 0, (size_t)(6 * d) * sizeof(float));
+    GSF__TRY(gsf__dit_gates_grad(t, s->m1, s->b1));
+    GSF__TRY(gsf__dit_linear_grad(t, &block->self.out, s->attended, n, t->db, t->dn, 0));
+    GSF__TRY(gsf__dit_attention_grad(t, &a, t->dn));
+    GSF__TRY(gsf__dit_head_grad(t, &block->self.norm_q, 1, s->q, n, t->dq));
+    GSF__TRY(gsf__dit_head_grad(t, &block->self.norm_k, 1, s->k, n, t->dk));
+    GSF__TRY(gsf__dit_linear_grad(t, &block->self.q, s->n1, n, t->dq, t->dn, 0));
+    GSF__TRY(gsf__dit_linear_grad(t, &block->self.k, s->n1, n, t->dk, t->dn, 1));
+    GSF__TRY(gsf__dit_linear_grad(t, &block->self.v, s->n1, n, t->dv, t->dn, 1));
+    return gsf__dit_modulate_grad(t, &block->norm1, x, s->m1);
+}
+
+// From dout (frames, channels, height, width) to t->dx, the gradient of what the last block returns.
+static gsf_result gsf__dit_output_grad(gsf__dit_train* t, const float* x, const float* dout) {
+    gsf__dit_run* run = &t->run;
+    const gsf_nn_transformer* c = run->net;
+    const gsf__dit_norm* norm = &run->nets->norm_out;
+    const int64_t d = run->width, at = run->text * d;
+    const float eps = (float)c->norm_eps;
+    float *m = run->modulation, *normed = t->kept.n1, *modulated = t->kept.n2;
+    const gsf__nn_patch_job job = {dout, t->patches, c->out_channels, run->in->height, run->in->width, c->patch, 0, NULL,
+                                   NULL};
+    gsf__nn_patch(run->nn.ctx, &job, run->in->frames);
+    gsf__nn_norm(&run->nn, &run->nets->norm_final, eps, x + at, run->video, normed);
+    GSF__TRY(gsf__dit_linear(run, &norm->linear, run->time, 1, m));
+    const gsf__nn_vectors v = gsf__nn_widen_layer(&run->nn, &norm->norm);
+    gsf__nn_layer_norm_modulated(run->nn.ctx, normed, run->video, d, v.weight, v.bias, eps, m + d, m, modulated);
+    memset(t->dm, 0, (size_t)(6 * d) * sizeof(float));
+    memset(t->dx, 0, (size_t)at * sizeof(float));
+    GSF__TRY(gsf__dit_linear_grad(t, &run->nets->out, modulated, run->video, t->patches, t->db, 0));
+    GSF__TRY(gsf__dit_norm_grad(t, &norm->norm, eps, normed, run->video, m + d, t->dm + d, t->dm, t->db, t->dn, 0));
+    GSF__TRY(gsf__dit_linear_grad(t, &norm->linear, run->time, 1, t->dm, t->dtime, 1));
+    return gsf__dit_norm_grad(t, &run->nets->norm_final, eps, x + at, run->video, NULL, NULL, NULL, t->dn, t->dx + at, 0);
+}
+
+// Layers that come before the blocks, from t->dx, dtime and dreferences on.
+static gsf_result gsf__dit_input_grad(gsf__dit_train* t) {
+    gsf__dit_run* run = &t->run;
+    const gsf_nn_transformer* c = run->net;
+    const gsf__dit_nets* nets = run->nets;
+    const int64_t d = run->width, time = c->time_channels, r = run->in->reference_tokens;
+    const gsf__nn_patch_job job = {run->in->hidden, t->patches, c->in_channels, run->in->height, run->in->width, c->patch, 0,
+                                   NULL, NULL};
+    gsf__nn_patch(run->nn.ctx, &job, run->in->frames);
+    GSF__TRY(gsf__dit_linear_grad(t, &nets->patch, t->patches, run->video, t->dx + run->text * d, NULL, 0));
+    GSF__TRY(gsf__dit_linear_grad(t, &nets->text, run->in->text, run->text, t->dx, NULL, 0));
+    gsf__nn_embed_timestep(run->in->timesteps[0], (int32_t)d, t->wave);
+    GSF__TRY(gsf__dit_linear(run, &nets->time1, t->wave, 1, t->time1));
+    float* hidden = t->hidden_time;
+    gsf__nn_activate(run->nn.ctx, GSF__NN_SILU, t->time1, time, hidden);
+    GSF__TRY(gsf__dit_linear(run, &nets->time2, hidden, 1, t->time2));
+    gsf__nn_activate_grad(run->nn.ctx, GSF__NN_SILU, t->time2, t->dtime, time, t->dtime);
+    GSF__TRY(gsf__dit_linear_grad(t, &nets->time2, hidden, 1, t->dtime, t->time2, 0));
+    gsf__nn_activate_grad(run->nn.ctx, GSF__NN_SILU, t->time1, t->time2, time, t->time2);
+    GSF__TRY(gsf__dit_linear_grad(t, &nets->time1, t->wave, 1, t->time2, NULL, 0));
+    const struct { const gsf__dit_projector* by; const float* from; } parts[2] = {{&nets->dino, t->dino},
+                                                                                 {&nets->vggt, t->vggt}};
+    for (int i = 0; i < 2 && r > 0; i++) {
+        if (!parts[i].from) continue;
+        GSF__TRY(gsf__dit_linear(run, &parts[i].by->linear, parts[i].from, r, t->dk));
+        GSF__TRY(gsf__dit_norm_grad(t, &parts[i].by->norm, 1e-5f, t->dk, r, NULL, NULL, NULL, t->dreferences, t->dn, 0));
+        GSF__TRY(gsf__dit_linear_grad(t, &parts[i].by->linear, parts[i].from, r, t->dn, NULL, 0));
+    }
+    return GSF_OK;
+}
+
+// ---- transformer: a training step
+
+typedef struct gsf__dit_example { // what one training example is made of
+    const float *latents, *noise; // (frames, out_channels, height, width)
+    const float* control;         // the same with the other in_channels - out_channels channels
+    const float* text;            // (text tokens, text_channels)
+    const float *dino, *vggt;     // (reference_tokens, dino_channels or vggt_channels); may both be NULL
+    int64_t reference_tokens;
+    int32_t timestep;             // 0 .. train_steps - 1
+} gsf__dit_example;
+
+typedef struct gsf__dit_train_desc {
+    int32_t frames, height, width; // of the latents
+    int32_t batch;                // examples whose losses are averaged
+    const gsf__dit_example* examples;
+    const gsf_nn_schedule* schedule;
+    float* predicted;             // NULL, or (batch, frames, out_channels, height, width): for tests
+} gsf__dit_train_desc;
+
+GSF__SHARED int gsf__dit_trains(const char* name) { return strcmp(name, "patch_embed.pos_embedding") != 0; } // it is a buffer
+
+// Divides the memory of a step; returns the floats needed.
+static size_t gsf__dit_lay_out_train(gsf__dit_train* t, float* memory) {
+    const gsf_nn_transformer* c = t->run.net;
+    const size_t forward = gsf__dit_lay_out(&t->run, memory), d = (size_t)t->run.width, n = (size_t)t->run.tokens;
+    const size_t r = (size_t)t->run.in->reference_tokens, rows = gsf__nn_larger(n, r), video = (size_t)t->run.video;
+    const size_t channels = (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
+    gsf__nn_arena arena = {memory, forward};
+    gsf__dit_trace* s = &t->kept;
+    float** const whole[] = {&s->n1, &s->q, &s->k, &s->v, &s->qn, &s->kn, &s->attended, &s->b1, &s->x1, &s->nc, &s->cq,
+                             &s->cqn, &s->looked, &s->n2, &s->b2, &s->x2, &t->dx};
+    float** const larger[] = {&s->ck, &s->cv, &s->ckn, &t->dn, &t->db, &t->dq, &t->dk, &t->dv, &t->references,
+                              &t->dreferences};
+    for (size_t i = 0; i < GSF__COUNT(whole); i++) *whole[i] = gsf__nn_share(&arena, n * d);
+    for (size_t i = 0; i < GSF__COUNT(larger); i++) *larger[i] = gsf__nn_share(&arena, rows * d);
+    s->up = gsf__nn_share(&arena, 4 * n * d);
+    s->hidden = gsf__nn_share(&arena, 4 * n * d);
+    t->dhidden = gsf__nn_share(&arena, 4 * n * d);
+    s->lse = gsf__nn_share(&arena, (size_t)c->heads * n);
+    s->cross_lse = gsf__nn_share(&arena, (size_t)c->heads * video);
+    s->m1 = gsf__nn_share(&arena, 6 * d);
+    s->m2 = gsf__nn_share(&arena, 6 * d);
+    t->dm = gsf__nn_share(&arena, 6 * d);
+    t->inputs = gsf__nn_share(&arena, gsf__nn_product((size_t)c->layers + 1, n * d));
+    t->patches = gsf__nn_share(&arena, video * (size_t)c->patch * (size_t)c->patch * channels);
+    t->out = gsf__nn_share(&arena, 3 * video * (size_t)c->patch * (size_t)c->patch * channels);
+    t->wave = gsf__nn_share(&arena, d);
+    t->dtime = gsf__nn_share(&arena, (size_t)c->time_channels);
+    t->time1 = gsf__nn_share(&arena, (size_t)c->time_channels);
+    t->time2 = gsf__nn_share(&arena, (size_t)c->time_channels);
+    t->hidden_time = gsf__nn_share(&arena, (size_t)c->time_channels);
+    return arena.used;
+}
+
+// Noisy latents and control, frame by frame the channels of both.
+static void gsf__dit_join_input(const gsf__dit_train* t, const float* noisy, const float* control, float* hidden) {
+    const gsf_nn_transformer* c = t->run.net;
+    const size_t plane = (size_t)t->run.in->height * (size_t)t->run.in->width;
+    const size_t first = (size_t)c->out_channels * plane, second = (size_t)c->in_channels * plane - first;
+    for (int32_t f = 0; f < t->run.in->frames; f++, hidden += first + second) {
+        memcpy(hidden, noisy + (size_t)f * first, first * sizeof(float));
+        memcpy(hidden + first, control + (size_t)f * second, second * sizeof(float));
+    }
+}
+
+// Adds an example's squared error to *loss and its gradients, both times `share`.
+static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train_desc* desc, const gsf__dit_example* e,
+                                         double share, float* predicted, double* loss) {
+    gsf__dit_run* run = &t->run;
+    gsf_context* ctx = run->nn.ctx;
+    const gsf_nn_transformer* c = run->net;
+    const size_t count = (size_t)desc->frames * (size_t)c->out_channels * (size_t)desc->height * (size_t)desc->width;
+    const size_t rows = (size_t)(run->tokens * run->width);
+    const size_t pixels = count / (size_t)c->out_channels;
+    float *out = t->out, *hidden = out + count, *target = hidden + pixels * (size_t)c->in_channels;
+    double sum = 0.0;
+    gsf__nn_add_noise(ctx, desc->schedule, e->timestep, e->latents, e->noise, count, target);
+    gsf__dit_join_input(t, target, e->control, hidden);
+    t->dino = e->dino;
+    t->vggt = e->vggt;
+    if (e->reference_tokens)
+        GSF__TRY(gsf_nn_project_references(ctx, c, e->reference_tokens, e->dino, e->vggt, t->references));
+    GSF__TRY(gsf__dit_embed_time(run));
+    GSF__TRY(gsf__dit_embed(run));
+    for (int32_t i = 0; i < c->layers; i++) {
+        memcpy(t->inputs + (size_t)i * rows, run->x, rows * sizeof(float));
+        GSF__TRY(gsf__dit_block_forward(run, i));
+    }
+    memcpy(t->inputs + (size_t)c->layers * rows, run->x, rows * sizeof(float));
+    GSF__TRY(gsf__dit_head(run, 0, out));
+    GSF__TRY(gsf__nn_check(&run->nn, "the output layer", "proj_out.", out, (int64_t)count));
+    if (predicted) memcpy(predicted, out, count * sizeof(float));
+    gsf__nn_make_velocity(ctx, desc->schedule, e->timestep, e->latents, e->noise, count, target);
+    for (size_t i = 0; i < count; i++) {
+        const double error = (double)out[i] - (double)target[i];
+        sum += error * error;
+        out[i] = (float)(2.0 * share * error);
+    }
+    *loss += share * sum;
+    memset(t->dtime, 0, (size_t)c->time_channels * sizeof(float));
+    memset(t->dreferences, 0, (size_t)(e->reference_tokens * run->width) * sizeof(float));
+    GSF__TRY(gsf__dit_output_grad(t, t->inputs + (size_t)c->layers * rows, out));
+    for (int32_t i = c->layers - 1; i >= 0; i--) {
+        float* x = t->inputs + (size_t)i * rows;
+        GSF__TRY(gsf__dit_trace_block(t, &run->nets->blocks[i], x));
+        GSF__TRY(gsf__dit_block_backward(t, &run->nets->blocks[i], x));
+        GSF__TRY(gsf__check_cancel(ctx));
+    }
+    return gsf__dit_input_grad(t);
+}
+
+static gsf_result gsf__dit_check_training(gsf_context* ctx, const gsf_nn_transformer* c, const gsf__dit_train_desc* desc) {
+    const gsf__dit_nets* nets = (const gsf__dit_nets*)c->nets;
+    if (nets->quantized) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "training: the transformer has 8-bit layers");
+    if (c->bf16) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "training: bf16 products are not supported");
+    for (int32_t b = 0; b < desc->batch; b++) {
+        const gsf__dit_example* e = &desc->examples[b];
+        if (!e->latents || !e->control || !e->noise || !e->text || e->timestep < 0 ||
+            e->timestep >= desc->schedule->desc.train_steps || (e->reference_tokens > 0) != (e->dino || e->vggt))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "training: example %d lacks an input or has time step %d", (int)b,
+                            (int)e->timestep);
+    }
+    return GSF_OK;
+}
+
+// Adds the gradients of a batch to params->grad, made of the transformer's weights; loss: the mean squared error of the
+// predicted velocities.
+GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                 gsf__nn_params* params, const gsf__dit_train_desc* desc, double* loss) {
+    const gsf_nn_transformer* c = transformer;
+    gsf_result result = GSF_OK;
+    *loss = 0.0;
+    GSF__TRY(gsf__dit_check_training(ctx, c, desc));
+    const double count = (double)desc->frames * c->out_channels * desc->height * desc->width;
+    for (int32_t b = 0; b < desc->batch && !result; b++) {
+        const gsf__dit_example* e = &desc->examples[b];
+        const double time = e->timestep;
+        gsf_nn_transformer_desc in;
+        gsf__dit_train t;
+        memset(&t, 0, sizeof t);
+        memset(&in, 0, sizeof in);
+        in.batch = in.reference_batch = 1;
+        in.frames = desc->frames;
+        in.height = desc->height;
+        in.width = desc->width;
+        in.text = e->text;
+        in.timesteps = &time;
+        in.reference_tokens = e->reference_tokens;
+        in.hidden = in.references = e->latents; // until there is memory; NULL means none
+        if (!e->reference_tokens) in.references = NULL;
+        t.params = params;
+        GSF__TRY(gsf__dit_check_input(ctx, c, &in));
+        gsf__dit_begin_run(&t.run, ctx, c);
+        gsf__dit_set_input(&t.run, &in);
+        float* memory = (float*)gsf_alloc(ctx, gsf__dit_lay_out_train(&t, NULL), sizeof(float));
+        if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+        gsf__dit_lay_out_train(&t, memory);
+        in.hidden = t.out + (size_t)count;
+        if (e->reference_tokens) in.references = t.references;
+        result = gsf__dit_make_rope(&t.run);
+        if (!result)
+            result = gsf__dit_train_example(&t, desc, e, 1.0 / (count * desc->batch),
+                                            desc->predicted ? desc->predicted + (size_t)b * (size_t)count : NULL, loss);
+        gsf__nn_destroy_workspace(ctx, &t.run.nn.workspace);
+        gsf_free(ctx, memory);
+    }
+    return result;
 }
 
 #endif // GSF_NN_TRAINING

@@ -51,6 +51,10 @@ gsfixer_nn.h|test_nn_gradients|gradients: convolution kernels not mirrored|s/\+ 
 gsfixer_nn.h|test_nn_gradients|gradients: frames before the first get none of a convolution|s/if \(job\.out\) gsf__conv_frame/if (job.out \&\& s >= 0) gsf__conv_frame/
 gsfixer_nn.h|test_nn_gradients|gradients: warping forgets the weights of its taps|s/b->weight\[to\] = f->weight\[k\];/b->weight[to] = 1.0f;/
 gsfixer_nn.h|test_nn_gradients|gradients: the candidates of a blend as if independent|s/dlogits\[k\] = weight\[k\] \* \(dlogits\[k\] - mean\)/dlogits[k] *= weight[k]/
+gsfixer_nn.h|golden_training|training: references get no gradient from the values|s/(&block->cross\.v, t->references, r, t->dv, t->dreferences, 1\))/&block->cross.v, t->references, r, t->dv, t->dn, 0)/
+gsfixer_nn.h|golden_training|training: the gates of text for the video|s/(t->dx \+ at, run->video, d, t->db \+ at,\s*t->dm \+) GSF__DIT_VIDEO_GATE/$1 GSF__DIT_TEXT_GATE/
+gsfixer_nn.h|golden_training|training: gradients are not clipped|s/job\.terms\.scale = \(float\)\(mean \* clip\)/job.terms.scale = (float)mean/
+gsfixer_nn.h|golden_training|training: weight decay goes through the moments' rate only|s/1\.0 - rate \* d->weight_decay/1.0 - 0.0 * d->weight_decay/
 gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(gsf__v_load_first\(dp \+ j, left\) - less\)/gsf__v_load_first(dp + j, left)/
 END
 }
