@@ -612,12 +612,17 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
                that exists.
                    LPIPS            alexnet-owt-7be5be79, vgg16-397923af or squeezenet1_1-b8a52dc0 (torchvision), and
                                     alex, vgg or squeeze (linear layers, version 0.1: lpips/weights/v0.1)
+                   I2V subject      dino_vitbase16_pretrain
+                   I2V background   the same, clip_vitb16_pretrain, open_clip_vitb16_pretrain, and ensemble_lora/ with
+                                    adapter_model and adapter_config.json (DreamSim's dreamsim_ensemble_checkpoint)
    CONVENTIONS Reported LPIPS values follow one of two: images scaled to [-1,1], as the lpips package documents it and as
                gsplat's trainer uses AlexNet; or images in [0,1] taken as if they were in [-1,1] (`raw`), as 3DGS, GSFixer
-               and gsplat's trainer use VGG16. The values of the two cannot be compared. */
+               and gsplat's trainer use VGG16. The values of the two cannot be compared.
+               I2V follows VBench with torchvision 0.17 or later: frames are resized with antialiasing. */
 
 typedef enum gsf_nn_metric_kind {
     GSF_NN_METRIC_LPIPS_ALEX = 0, GSF_NN_METRIC_LPIPS_VGG, GSF_NN_METRIC_LPIPS_SQUEEZE, // Zhang et al. 2018; low is good
+    GSF_NN_METRIC_I2V_SUBJECT, GSF_NN_METRIC_I2V_BACKGROUND, // VBench's I2V_SC and I2V_BC: consistency with an input image
 } gsf_nn_metric_kind;
 
 typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when done
@@ -625,16 +630,18 @@ typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when d
     const char* models;        // folder with the weights; needed until the first frame has been measured
     int32_t raw;               // LPIPS: leave the images in [0,1]
     // results
-    double score;              // of all frames so far; LPIPS: the mean
-    double last;               // of the last frame
+    double score;              // of all frames so far. LPIPS: the mean. I2V: 0 before the second frame
+    double last;               // of the last frame. LPIPS: its distance. I2V: its similarity to the input image
     int64_t count;             // frames measured
     void* state;               // private
     const gsf__nn_tap* _tap;   // private
+    const int32_t* _heads;     // private: attention heads of each network; NULL: as many as have 64 channels
 } gsf_nn_metric;
 
-// Measures the next frame, which has three channels; `reference` is its true image, of the same size. The first call opens
-// the weights; frame NULL only does that. A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or
-// infinity GSF_ERROR_NUMERIC, frames that are too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
+// Measures the next frame, which has three channels. `reference`: for LPIPS its true image, of the same size; for I2V the
+// input image, of any size, which only the first frame needs. The first call opens the weights; frame NULL only does that.
+// A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or infinity GSF_ERROR_NUMERIC, frames that are
+// too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
                                                       const gsf_image* reference);
 GSF_API void gsf_nn_destroy_metric(gsf_context* ctx, gsf_nn_metric* metric);
@@ -671,9 +678,10 @@ typedef struct gsf__nn_workspace { // scratch memory of kernels; zero-initialise
     size_t size;
 } gsf__nn_workspace;
 
-// GELU is x/2 (1 + erf(x / sqrt 2)), with a relative error below 1e-6 for all x; GELU_TANH is its usual approximation.
+// GELU is x/2 (1 + erf(x / sqrt 2)), with a relative error below 1e-6 for all x; GELU_TANH is its usual approximation,
+// QUICK_GELU, x / (1 + exp(-1.702 x)), that of CLIP.
 typedef enum gsf__nn_activation {
-    GSF__NN_LINEAR = 0, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU, GSF__NN_RELU,
+    GSF__NN_LINEAR = 0, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU, GSF__NN_RELU, GSF__NN_QUICK_GELU,
 } gsf__nn_activation;
 
 typedef struct gsf__nn_linear_desc {
@@ -2976,6 +2984,7 @@ static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
         case GSF__NN_SILU: return x < -104.0f ? -0.0f : x / (1.0f + expf(-x));
         case GSF__NN_GELU: return gsf__nn_gelu_ref(x);
         case GSF__NN_RELU: return x < 0.0f ? 0.0f : x;
+        case GSF__NN_QUICK_GELU: return x < -61.0f ? -0.0f : x / (1.0f + expf(-1.702f * x));
     }
     return x;
 }
@@ -3070,6 +3079,10 @@ GSF__V_INLINE gsf__vf gsf__v_activate(gsf__nn_activation activation, gsf__vf x) 
     }
     if (activation == GSF__NN_GELU) return gsf__v_gelu(x);
     if (activation == GSF__NN_RELU) return gsf__v_max(gsf__v_set(0.0f), x);
+    if (activation == GSF__NN_QUICK_GELU) {
+        x = gsf__v_max(gsf__v_set(-58.0f), x);
+        return x / (one + gsf__v_exp(gsf__v_set(-1.702f) * x));
+    }
     return x;
 }
 
@@ -3095,6 +3108,7 @@ GSF__V_KERNEL void GSF__V(gsf__activate)(gsf__nn_activation activation, const fl
         GSF_X(GSF__NN_SILU)
         GSF_X(GSF__NN_GELU)
         GSF_X(GSF__NN_RELU)
+        GSF_X(GSF__NN_QUICK_GELU)
     }
 #undef GSF_X
     gsf__nn_end_stream(stream);
@@ -7202,6 +7216,8 @@ typedef struct gsf__vit { // pixels to tokens: a DINOv2
     const char *block_names, *prefix; // tensor names of the blocks; of the embeddings
     const gsf_nn_tensor *class_token, *register_tokens, *positions;
     gsf__nn_layer patches, norm;
+    gsf__nn_layer pre_norm;        // CLIP: before the blocks
+    const float *mean, *deviation; // of each channel of the pixels, for normalization; NULL: none
     gsf__nn_block* blocks;
 } gsf__vit;
 
@@ -7316,30 +7332,31 @@ static const float gsf__imagenet_mean[3] = {0.485f, 0.456f, 0.406f}, gsf__imagen
 
 // Tokens of one image before the blocks: class, registers, patches.
 static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t image,
-                                 int normalize, const float* positions, float* x) {
+                                 const float* positions, float* x) {
     const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
     const int64_t tokens = 1 + vit->registers + down * across;
     float* patches = x + (1 + vit->registers) * d;
     gsf__nn_patch_job job = {in->pixels + image * vit->channels * in->height * in->width, run->wide, vit->channels,
-                             in->height, in->width, p, 0, normalize ? gsf__imagenet_mean : NULL, gsf__imagenet_deviation};
+                             in->height, in->width, p, 0, vit->mean, vit->deviation};
     gsf__nn_patch(run->ctx, &job, 1);
     gsf_nn_convert_tensor(vit->class_token, 0, d, x);
     for (int64_t i = 0; i < d; i++) x[i] += positions[i];
     gsf_nn_convert_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
     memcpy(patches, positions + d, (size_t)(down * across * d) * sizeof(float));
     GSF__TRY(gsf__nn_add(run, &vit->patches, NULL, run->wide, down * across, patches));
+    if (vit->pre_norm.weight) gsf__nn_norm(run, &vit->pre_norm, vit->sizes.eps, x, tokens, x);
     gsf__nn_reveal(run, x, image, 1, tokens, d, "embeddings");
     return gsf__nn_check(run, vit->prefix, vit->prefix, x, tokens * d);
 }
 
 // Embeds `count` images from `first` on and runs the blocks: x (count, tokens, width), before the final norm.
 static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t first,
-                                   int64_t count, int normalize, const float* positions, float* x) {
+                                   int64_t count, const float* positions, float* x) {
     const int64_t d = vit->sizes.width;
     const int64_t tokens = 1 + vit->registers + in->height / vit->patch * (in->width / vit->patch);
     run->sizes = &vit->sizes;
     for (int64_t i = 0; i < count; i++)
-        GSF__TRY(gsf__vit_embed(run, vit, in, first + i, normalize, positions, x + i * tokens * d));
+        GSF__TRY(gsf__vit_embed(run, vit, in, first + i, positions, x + i * tokens * d));
     for (int64_t layer = 0; layer < vit->layers; layer++) {
         GSF__TRY(gsf__nn_block_forward(run, &vit->blocks[layer], layer, x, count, tokens));
         GSF__TRY(gsf__nn_end_block(run, vit->block_names, layer, x, count * tokens * d));
@@ -7510,7 +7527,7 @@ static gsf_result gsf__dinov2_run(gsf__nn_run* run, const gsf__vit* vit, const g
     run->steps = (double)(gsf__ceil_div(in->images, plan->group) * vit->layers);
     for (int64_t first = 0; first < in->images; first += plan->group) {
         const int64_t count = gsf__least(in->images - first, plan->group);
-        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 0, plan->positions, plan->x));
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, plan->positions, plan->x));
         for (int64_t i = 0; i < count; i++) {
             const float* tokens = plan->x + i * plan->tokens * d;
             gsf__nn_norm(run, &vit->norm, vit->sizes.eps, tokens + skip * d, kept, out + (first + i) * kept * d);
@@ -7528,7 +7545,7 @@ static const char gsf__vggt_frame_names[] = "aggregator.frame_blocks.";
 static const char gsf__vggt_global_names[] = "aggregator.global_blocks.";
 
 // One more than the highest block number that follows `names` in a tensor's name.
-static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char* names) {
+static int64_t gsf__nn_count_blocks(const gsf_nn_weights* weights, const char* names) {
     const size_t size = strlen(names);
     int64_t count = 0;
     for (size_t i = 0; i < weights->tensor_count; i++) {
@@ -7559,14 +7576,16 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     net->sizes.width = vit->sizes.width = patch->shape[0];
     net->sizes.mlp = up->shape[0];
     net->registers = registers->shape[2];
-    net->layers = gsf__vggt_count_blocks(w, gsf__vggt_frame_names);
+    net->layers = gsf__nn_count_blocks(w, gsf__vggt_frame_names);
     vit->sizes.mlp = embed_up->shape[0];
     vit->channels = patch->shape[1];
     vit->patch = patch->shape[2];
     vit->registers = embed_registers->shape[1];
-    vit->layers = gsf__vggt_count_blocks(w, "aggregator.patch_embed.blocks.");
+    vit->layers = gsf__nn_count_blocks(w, "aggregator.patch_embed.blocks.");
     vit->block_names = "aggregator.patch_embed.blocks.";
     vit->prefix = "aggregator.patch_embed.";
+    vit->mean = gsf__imagenet_mean;
+    vit->deviation = gsf__imagenet_deviation;
     while (vit->grid < 1 << 15 && (vit->grid + 1) * (vit->grid + 1) < positions->shape[1]) vit->grid++;
     vit->sizes.activation = net->sizes.activation = GSF__NN_GELU;
     vit->sizes.qkv_bias = net->sizes.qkv_bias = 1;
@@ -7727,7 +7746,7 @@ static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const 
     const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
     for (int64_t first = 0; first < in->images; first += plan->group) {
         const int64_t count = gsf__least(in->images - first, plan->group);
-        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 1, plan->positions, plan->x));
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, plan->positions, plan->x));
         for (int64_t i = 0; i < count; i++) {
             const float* patches = plan->x + (i * plan->tokens + 1 + vit->registers) * d;
             float* to = plan->stream + (first + i) * tokens * d;
@@ -9274,7 +9293,7 @@ static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, flo
     in.height = in.width = (int32_t)run->net->image_size;
     run->nn.tap = NULL; // only the final result is shown
     gsf_result result = gsf__vit_open_run(&run->nn, vit, NULL, &in, &plan, &memory);
-    if (!result) result = gsf__vit_forward(&run->nn, vit, &in, 0, 1, 0, plan.positions, plan.x);
+    if (!result) result = gsf__vit_forward(&run->nn, vit, &in, 0, 1, plan.positions, plan.x);
     if (!result) {
         static const char name[] = "vision_model.post_layernorm.";
         gsf__nn_norm(&run->nn, &vit->norm, vit->sizes.eps, plan.x, plan.tokens, out);
@@ -14377,7 +14396,8 @@ static gsf_result gsf__lpips_open(gsf_context* ctx, const char* models, int kind
     return gsf__nn_end_loading(&backbone, result);
 }
 
-static void gsf__lpips_close(gsf_context* ctx, gsf__lpips* net) {
+static void gsf__lpips_close(gsf_context* ctx, void* state) {
+    gsf__lpips* net = (gsf__lpips*)state;
     gsf_nn_destroy_weights(ctx, &net->backbone);
     gsf_nn_destroy_weights(ctx, &net->heads);
     gsf__destroy_maps(ctx, &net->maps);
@@ -14500,7 +14520,7 @@ static gsf_result gsf__lpips_store(gsf_context* ctx, const gsf_image* image, int
     return GSF_OK;
 }
 
-static gsf_result gsf__lpips_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* a, const gsf_image* b,
+static gsf_result gsf__lpips_compare(gsf_context* ctx, const gsf_nn_metric* metric, const gsf_image* a, const gsf_image* b,
                                      double* out) {
     gsf__lpips* net = (gsf__lpips*)metric->state;
     gsf__maps* maps = &net->maps;
@@ -14535,17 +14555,409 @@ static gsf_result gsf__lpips_measure(gsf_context* ctx, gsf_nn_metric* metric, co
     return GSF_OK;
 }
 
+static gsf_result gsf__lpips_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                     const gsf_image* reference) {
+    const char* name = gsf__lpips_nets[metric->kind].name;
+    double value;
+    if (!reference || frame->width != reference->width || frame->height != reference->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: two images of one size are needed", name);
+    GSF__TRY(gsf__lpips_compare(ctx, metric, frame, reference, &value));
+    if (!(fabs(value) <= DBL_MAX)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: the distance is %g", name, value);
+    metric->last = value;
+    metric->score += (value - metric->score) / (double)++metric->count;
+    return GSF_OK;
+}
+
+// ---- metrics: image encoders
+
+/* Vision transformers under the names of DINO (Caron et al. 2021; github.com/facebookresearch/dino vision_transformer.py),
+   in which DreamSim also publishes its CLIP models. The feature of an image is its class token: after the final norm, and
+   projected where the file has `proj`. Sizes follow from the tensors, heads have 64 channels. */
+
+typedef struct gsf__tower_form { // what the file does not say
+    const char* file;
+    float eps;
+    gsf__nn_activation activation;
+    const float *mean, *deviation; // of the pixels
+    int clip, no_norm; // CLIP: a norm before the blocks and a projection; the class token is taken before the final norm
+} gsf__tower_form;
+
+typedef struct gsf__tower {
+    gsf_nn_weights weights;
+    gsf__vit vit;
+    const gsf_nn_tensor* projection; // (width, features) or NULL
+    int64_t features;
+    gsf_nn_tensor* qkv; // (layers) weights with their LoRA added, owned; NULL: those of the file
+    int no_norm;
+} gsf__tower;
+
+static const gsf__nn_entry gsf__tower_block_entries[] = { // below blocks.N.
+    {"norm1", "d", GSF__NN_BLOCK(norm1)},
+    {"norm2", "d", GSF__NN_BLOCK(norm2)},
+    {"attn.qkv", "td", GSF__NN_BLOCK(qkv)},
+    {"attn.proj", "dd", GSF__NN_BLOCK(out)},
+    {"mlp.fc1", "md", GSF__NN_BLOCK(up)},
+    {"mlp.fc2", "dm", GSF__NN_BLOCK(down)},
+    GSF__NN_END,
+};
+
+static const gsf__nn_entry gsf__tower_entries[] = {
+    {"cls_token", "11d", GSF__VIT_TENSOR(class_token)},
+    {"pos_embed", "1sd", GSF__VIT_TENSOR(positions)},
+    {"patch_embed.proj", "dcpp", GSF__NN_AT(gsf__vit, patches)},
+    {"norm", "d", GSF__NN_AT(gsf__vit, norm)},
+    GSF__NN_END,
+};
+
+static const gsf__nn_entry gsf__tower_clip_entries[] = {{"pos_drop", "d", GSF__NN_AT(gsf__vit, pre_norm)}, GSF__NN_END};
+
+// Width, patch and grid come from the tensors that embed the image.
+static gsf_result gsf__tower_infer(gsf__nn_loader* loader, const gsf_nn_tensor* patches, const gsf_nn_tensor* positions,
+                                   int64_t position_count, int64_t mlp, int32_t heads, gsf__vit* vit) {
+    gsf__nn_block_sizes* s = &vit->sizes;
+    s->width = patches->shape[0];
+    s->mlp = mlp;
+    s->heads = heads ? heads : (int32_t)gsf__least(s->width / 64, 4096);
+    vit->channels = patches->shape[1];
+    vit->patch = patches->shape[patches->rank - 1];
+    vit->grid = (int64_t)floor(sqrt((double)position_count - 0.5));
+    const int fits = s->heads > 0 && s->width % s->heads == 0 && s->width < 1 << 16 && vit->channels == 3 &&
+                     vit->patch > 0 && vit->patch < 1024 && vit->grid > 0 && vit->grid < 1024 &&
+                     vit->grid * vit->grid + 1 == position_count && vit->layers > 0 && mlp > 0;
+    if (!fits)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensors %s and %s do not fit a vision transformer",
+                        loader->weights->name, patches->name, positions->name);
+    s->head_dim = (int32_t)(s->width / s->heads);
+    return GSF_OK;
+}
+
+static gsf_result gsf__tower_bind(gsf__nn_loader* loader, const gsf__tower_form* form, int32_t heads, gsf__tower* tower) {
+    static const int64_t any[4] = {-1, -1, -1, -1};
+    const gsf_nn_tensor *patches, *positions, *up;
+    gsf__vit* vit = &tower->vit;
+    GSF__TRY(gsf__nn_need(loader, &patches, 4, any, "patch_embed.proj.weight"));
+    GSF__TRY(gsf__nn_need(loader, &positions, 3, any, "pos_embed"));
+    GSF__TRY(gsf__nn_need(loader, &up, 2, any, "blocks.0.mlp.fc1.weight"));
+    vit->layers = gsf__nn_count_blocks(loader->weights, "blocks.");
+    GSF__TRY(gsf__tower_infer(loader, patches, positions, positions->shape[1], up->shape[0], heads, vit));
+    vit->sizes.eps = form->eps;
+    vit->sizes.activation = form->activation;
+    vit->sizes.qkv_bias = 1;
+    vit->block_names = "blocks.";
+    vit->prefix = "patch_embed.";
+    vit->mean = form->mean;
+    vit->deviation = form->deviation;
+    tower->features = vit->sizes.width;
+    tower->no_norm = form->no_norm;
+    GSF__TRY(gsf__vit_bind(loader, gsf__tower_entries, gsf__tower_block_entries, "", vit));
+    vit->register_tokens = vit->class_token; // never read, as there are 0 registers
+    if (!form->clip) return GSF_OK;
+    const gsf__nn_sizes sizes = gsf__vit_sizes(vit);
+    const int64_t shape[2] = {vit->sizes.width, -1};
+    GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__tower_clip_entries, "", vit));
+    GSF__TRY(gsf__nn_need(loader, &tower->projection, 2, shape, "proj"));
+    tower->features = tower->projection->shape[1];
+    return GSF_OK;
+}
+
+static gsf_result gsf__tower_open(gsf_context* ctx, const char* models, const gsf__tower_form* form, int32_t heads,
+                                  gsf__tower* tower) {
+    gsf__nn_loader loader;
+    GSF__TRY(gsf_nn_load_weights(ctx, models, form->file, &tower->weights));
+    GSF__TRY(gsf__nn_begin_loading(ctx, &tower->weights, &loader));
+    return gsf__nn_end_loading(&loader, gsf__tower_bind(&loader, form, heads, tower));
+}
+
+static void gsf__tower_close(gsf_context* ctx, gsf__tower* tower) {
+    for (int64_t i = 0; tower->qkv && i < tower->vit.layers; i++) gsf_free(ctx, (void*)(uintptr_t)tower->qkv[i].data);
+    gsf_free(ctx, tower->qkv);
+    gsf_free(ctx, tower->vit.blocks);
+    gsf_nn_destroy_weights(ctx, &tower->weights);
+}
+
+// out (columns) = row (rows) times a matrix (rows, columns), in double.
+static gsf_result gsf__project_row(gsf_context* ctx, const float* row, const gsf_nn_tensor* matrix, float* out) {
+    const int64_t rows = matrix->shape[0], columns = matrix->shape[1];
+    double* sums = (double*)gsf_alloc_zeroed(ctx, (size_t)columns, sizeof(double) + sizeof(float));
+    if (!sums) return GSF_ERROR_OUT_OF_MEMORY;
+    float* wide = (float*)(void*)(sums + columns);
+    for (int64_t r = 0; r < rows; r++) {
+        gsf_nn_convert_tensor(matrix, r * columns, columns, wide);
+        for (int64_t c = 0; c < columns; c++) sums[c] += (double)row[r] * (double)wide[c];
+    }
+    for (int64_t c = 0; c < columns; c++) out[c] = (float)sums[c];
+    gsf_free(ctx, sums);
+    return GSF_OK;
+}
+
+// The feature of an image (3, height, width) in [0,1]: out (features).
+static gsf_result gsf__tower_encode(gsf_context* ctx, const char* name, const gsf__tower* tower, const float* pixels,
+                                    int64_t height, int64_t width, const gsf__nn_tap* tap, float* out) {
+    const gsf__vit* vit = &tower->vit;
+    gsf_nn_encoder_desc in;
+    gsf__nn_run run;
+    gsf__vit_plan plan;
+    float* memory = NULL;
+    memset(&in, 0, sizeof in);
+    memset(&run, 0, sizeof run);
+    in.pixels = pixels;
+    in.images = 1;
+    in.height = (int32_t)height;
+    in.width = (int32_t)width;
+    run.ctx = ctx;
+    run.name = run.stage = name;
+    run.weights = &tower->weights;
+    run.tap = tap;
+    run.steps = (double)vit->layers;
+    gsf_result result = gsf__vit_check_input(ctx, name, vit->channels, vit->patch, &in, out);
+    if (!result) result = gsf__vit_open_run(&run, vit, NULL, &in, &plan, &memory);
+    if (!result) result = gsf__vit_forward(&run, vit, &in, 0, 1, plan.positions, plan.x);
+    if (!result && !tower->no_norm) gsf__nn_norm(&run, &vit->norm, vit->sizes.eps, plan.x, 1, plan.x);
+    if (!result && tower->projection) result = gsf__project_row(ctx, plan.x, tower->projection, out);
+    else if (!result) memcpy(out, plan.x, (size_t)tower->features * sizeof(float));
+    if (!result) result = gsf__nn_check(&run, "feature", "", out, tower->features);
+    gsf__nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- metrics: consistency with an image (VBench, vbench2_beta_i2v)
+
+/* I2V subject takes the features of DINO ViT-B/16, I2V background those of DreamSim's ensemble (Fu et al. 2023): DINO, CLIP
+   and OpenCLIP ViT-B/16 with LoRA, concatenated, less their mean, divided by their norm. With the cosines c_t to the input
+   image and s_t to the frame before, both at least 0, the score is 0.4 max c + 0.3 mean s + 0.3 min s. VBench resizes the
+   input image as PIL does, in 8 bits, but frames as float tensors, neither rounded nor clamped. */
+
+enum { GSF__I2V_SIDE = 224, GSF__I2V_SHORT = 256, GSF__I2V_TOWERS = 3 };
+
+static const float gsf__clip_mean[3] = {0.48145466f, 0.4578275f, 0.40821073f},
+                   gsf__clip_deviation[3] = {0.26862954f, 0.26130258f, 0.27577711f};
+
+static const gsf__tower_form gsf__i2v_subject[] = {
+    {"dino_vitbase16_pretrain", 1e-6f, GSF__NN_GELU, gsf__imagenet_mean, gsf__imagenet_deviation, 0, 0},
+};
+static const gsf__tower_form gsf__i2v_background[] = {
+    {"dino_vitbase16_pretrain", 1e-6f, GSF__NN_GELU, gsf__imagenet_mean, gsf__imagenet_deviation, 0, 1},
+    {"clip_vitb16_pretrain", 1e-5f, GSF__NN_QUICK_GELU, gsf__clip_mean, gsf__clip_deviation, 1, 0},
+    {"open_clip_vitb16_pretrain", 1e-5f, GSF__NN_GELU, gsf__clip_mean, gsf__clip_deviation, 1, 0},
+};
+
+typedef struct gsf__i2v {
+    gsf__tower towers[GSF__I2V_TOWERS];
+    int count;
+    int64_t features;
+    float* values;  // (3, features): of the input image, of the frame before, of this frame
+    float* pixels;  // (3, 224, 224)
+    double most, sum, least; // of the cosines
+    int64_t frames; // including the input image
+} gsf__i2v;
+
+// Adds the LoRA of a tower's qkv layers: W + alpha / r B A.
+static gsf_result gsf__i2v_merge(gsf__nn_loader* loader, int index, int64_t rank, double scale, gsf__tower* tower) {
+    gsf_context* ctx = loader->ctx;
+    const int64_t d = tower->vit.sizes.width, shape_a[2] = {rank, d}, shape_b[2] = {3 * d, rank};
+    tower->qkv = (gsf_nn_tensor*)gsf_alloc_zeroed(ctx, (size_t)tower->vit.layers, sizeof *tower->qkv);
+    float* a = (float*)gsf_alloc(ctx, (size_t)(rank * (d + 1)), sizeof(float)); // A, and a row of B
+    gsf_result result = tower->qkv && a ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; i < tower->vit.layers && !result; i++) {
+        static const char name[] = "base_model.model.extractor_list.%d.model.blocks.%lld.attn.qkv.lora_%c.weight";
+        const gsf_nn_tensor *down, *up, *weight = tower->vit.blocks[i].qkv.weight;
+        result = gsf__nn_need(loader, &down, 2, shape_a, name, index, (long long)i, 'A');
+        if (!result) result = gsf__nn_need(loader, &up, 2, shape_b, name, index, (long long)i, 'B');
+        float* merged = result ? NULL : (float*)gsf_alloc(ctx, (size_t)weight->count, sizeof(float));
+        if (!result && !merged) result = GSF_ERROR_OUT_OF_MEMORY;
+        if (result) break;
+        gsf_nn_convert_tensor(weight, 0, weight->count, merged);
+        gsf_nn_convert_tensor(down, 0, down->count, a);
+        for (int64_t row = 0; row < 3 * d; row++) {
+            gsf_nn_convert_tensor(up, row * rank, rank, a + rank * d);
+            for (int64_t column = 0; column < d; column++) {
+                double sum = 0.0;
+                for (int64_t k = 0; k < rank; k++) sum += (double)a[rank * d + k] * (double)a[k * d + column];
+                merged[row * d + column] = (float)((double)merged[row * d + column] + scale * sum);
+            }
+        }
+        tower->qkv[i] = gsf_nn_wrap_tensor(weight->name, merged, 2, weight->shape);
+        tower->vit.blocks[i].qkv.weight = &tower->qkv[i];
+    }
+    gsf_free(ctx, a);
+    return result;
+}
+
+static gsf_result gsf__i2v_open_adapter(gsf_context* ctx, const char* models, gsf__i2v* net) {
+    gsf_buffer folder;
+    gsf__nn_config config;
+    gsf__nn_loader loader;
+    gsf_nn_weights weights;
+    int64_t rank = 1;
+    double alpha = 1.0;
+    memset(&weights, 0, sizeof weights);
+    memset(&config, 0, sizeof config);
+    config.ctx = ctx;
+    gsf_result result = gsf__nn_join(ctx, models, "ensemble_lora", &folder);
+    if (!result) result = gsf__nn_open_config(ctx, folder.data, "adapter_config.json", 0, &config);
+    if (!result) {
+        const gsf__nn_key keys[] = {GSF__KEY_INT("r", rank, 1, 4096), GSF__KEY_REAL_OR("lora_alpha", alpha, 8.0, 0.0, 1e6),
+                                    GSF__KEY_FLAG_IS("use_rslora", 0, 0), GSF__KEY_FLAG_IS("use_dora", 0, 0)};
+        result = gsf__nn_config_read(&config, keys, GSF__COUNT(keys));
+    }
+    gsf__nn_close_config(&config);
+    if (!result) result = gsf_nn_load_weights(ctx, folder.data, "adapter_model", &weights);
+    if (!result) result = gsf__nn_begin_loading(ctx, &weights, &loader);
+    if (!result) {
+        for (int i = 0; i < net->count && !result; i++)
+            result = gsf__i2v_merge(&loader, i, rank, alpha / (double)rank, &net->towers[i]);
+        result = gsf__nn_end_loading(&loader, result);
+    }
+    gsf_nn_destroy_weights(ctx, &weights);
+    gsf_destroy_buffer(ctx, &folder);
+    return result;
+}
+
+static gsf_result gsf__i2v_open(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
+    gsf__i2v* net = (gsf__i2v*)state;
+    const int background = metric->kind == GSF_NN_METRIC_I2V_BACKGROUND;
+    const gsf__tower_form* forms = background ? gsf__i2v_background : gsf__i2v_subject;
+    const int count = background ? GSF__I2V_TOWERS : 1;
+    for (; net->count < count; net->count++) {
+        gsf__tower* tower = &net->towers[net->count];
+        const gsf_result result =
+            gsf__tower_open(ctx, metric->models, &forms[net->count], metric->_heads ? metric->_heads[net->count] : 0, tower);
+        net->features += tower->features;
+        if (result) {
+            net->count++; // to close it
+            return result;
+        }
+    }
+    if (background) GSF__TRY(gsf__i2v_open_adapter(ctx, metric->models, net));
+    net->values = (float*)gsf_alloc(ctx, 3 * (size_t)net->features, sizeof(float));
+    net->pixels = (float*)gsf_alloc(ctx, 3 * GSF__I2V_SIDE * GSF__I2V_SIDE, sizeof(float));
+    return net->values && net->pixels ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static void gsf__i2v_close(gsf_context* ctx, void* state) {
+    gsf__i2v* net = (gsf__i2v*)state;
+    for (int i = 0; i < net->count; i++) gsf__tower_close(ctx, &net->towers[i]);
+    gsf_free(ctx, net->values);
+    gsf_free(ctx, net->pixels);
+}
+
+// Resizes to 224 x 224: whole, or the centre of the image with its shorter side at 256. pixels: (3, 224, 224) in [0,1]
+static gsf_result gsf__i2v_prepare(gsf_context* ctx, const gsf_image* image, int whole, gsf_dtype dtype, float* pixels) {
+    const int64_t side = GSF__I2V_SIDE, brief = GSF__I2V_SHORT, w = image->width, h = image->height;
+    const int64_t across = whole ? side : w <= h ? brief : brief * w / h, down = whole ? side : w <= h ? brief * h / w : brief;
+    const int64_t left = (int64_t)rint((double)(across - side) / 2.0), top = (int64_t)rint((double)(down - side) / 2.0);
+    gsf_image same, resized;
+    memset(&same, 0, sizeof same);
+    memset(&resized, 0, sizeof resized);
+    gsf_result result = gsf_make_image(ctx, dtype, w, h, 3, &same);
+    if (!result) result = gsf_convert_image(ctx, image, &same);
+    if (!result) result = gsf_make_image(ctx, dtype, across, down, 3, &resized);
+    if (!result) result = gsf_resize_image(ctx, &same, GSF_RESIZE_PIL_BICUBIC, &resized);
+    for (int64_t c = 0; c < 3 && !result; c++)
+        for (int64_t y = 0; y < side; y++)
+            for (int64_t x = 0; x < side; x++, pixels++) {
+                const char* at = (const char*)resized.data + (y + top) * resized.stride_y + (x + left) * resized.stride_x +
+                                 c * resized.stride_c;
+                if (dtype == GSF_U8) *pixels = (float)*(const uint8_t*)at / 255.0f;
+                else memcpy(pixels, at, sizeof *pixels);
+            }
+    gsf_destroy_image(ctx, &same);
+    gsf_destroy_image(ctx, &resized);
+    return result;
+}
+
+static gsf_result gsf__i2v_encode(gsf_context* ctx, const gsf_nn_metric* metric, const gsf_image* image, gsf_dtype dtype,
+                                  float* out) {
+    gsf__i2v* net = (gsf__i2v*)metric->state;
+    const char* name = net->count > 1 ? "i2v background" : "i2v subject";
+    float* feature = out;
+    GSF__TRY(gsf__i2v_prepare(ctx, image, net->count > 1, dtype, net->pixels));
+    if (metric->_tap)
+        metric->_tap->fn(metric->_tap->user, "pixels", (int32_t)net->frames, net->pixels, 3, GSF__I2V_SIDE * GSF__I2V_SIDE);
+    for (int i = 0; i < net->count; i++) {
+        const gsf__nn_tap* tap = net->frames == 0 ? metric->_tap : NULL; // layers of the input image only
+        GSF__TRY(gsf__tower_encode(ctx, name, &net->towers[i], net->pixels, GSF__I2V_SIDE, GSF__I2V_SIDE, tap, feature));
+        if (tap) tap->fn(tap->user, "tower", i, feature, 1, net->towers[i].features);
+        feature += net->towers[i].features;
+    }
+    if (net->count > 1) {
+        double mean = 0.0, square = 0.0;
+        for (int64_t i = 0; i < net->features; i++) mean += (double)out[i] / (double)net->features;
+        for (int64_t i = 0; i < net->features; i++) square += ((double)out[i] - mean) * ((double)out[i] - mean);
+        for (int64_t i = 0; i < net->features; i++) out[i] = (float)(((double)out[i] - mean) / sqrt(square));
+    }
+    if (metric->_tap) metric->_tap->fn(metric->_tap->user, "feature", (int32_t)net->frames, out, 1, net->features);
+    return GSF_OK;
+}
+
+static double gsf__cosine(const float* a, const float* b, int64_t count) {
+    double product = 0.0, of_a = 0.0, of_b = 0.0;
+    for (int64_t i = 0; i < count; i++) {
+        product += (double)a[i] * (double)b[i];
+        of_a += (double)a[i] * (double)a[i];
+        of_b += (double)b[i] * (double)b[i];
+    }
+    return product / sqrt(of_a * of_b);
+}
+
+static double gsf__not_below_zero(double x) { return x < 0.0 ? 0.0 : x; } // a NaN remains
+
+static gsf_result gsf__i2v_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                   const gsf_image* reference) {
+    gsf__i2v* net = (gsf__i2v*)metric->state;
+    const size_t bytes = (size_t)net->features * sizeof(float);
+    float *input = net->values, *before = input + net->features, *now = before + net->features;
+    if (net->frames == 0) {
+        if (!reference)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "i2v: the first frame needs the input image as its reference");
+        GSF__TRY(gsf__i2v_encode(ctx, metric, reference, GSF_U8, input));
+        net->frames = 1;
+    }
+    GSF__TRY(gsf__i2v_encode(ctx, metric, frame, GSF_F32, now));
+    const double to_input = gsf__not_below_zero(gsf__cosine(input, now, net->features));
+    const double to_last = net->frames > 1 ? gsf__not_below_zero(gsf__cosine(before, now, net->features)) : 0.0;
+    if (!(to_input + to_last <= 3.0)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "i2v: a feature is 0 or not finite");
+    if (to_input > net->most) net->most = to_input;
+    if (net->frames == 2 || (net->frames > 2 && to_last < net->least)) net->least = to_last;
+    net->sum += to_last;
+    memcpy(before, now, bytes);
+    metric->last = to_input;
+    metric->count = net->frames++;
+    if (metric->count > 1)
+        metric->score = 0.4 * net->most + 0.3 * net->sum / (double)(metric->count - 1) + 0.3 * net->least;
+    return GSF_OK;
+}
+
 // ---- metrics: streams of frames
+
+static gsf_result gsf__lpips_open_metric(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
+    return gsf__lpips_open(ctx, metric->models, (int)metric->kind, (gsf__lpips*)state);
+}
+
+static const struct gsf__metric_form { // by kind
+    size_t size; // of the state, which starts as zeros
+    gsf_result (*open)(gsf_context* ctx, const gsf_nn_metric* metric, void* state);
+    gsf_result (*measure)(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame, const gsf_image* reference);
+    void (*close)(gsf_context* ctx, void* state); // also of a state that failed to open
+} gsf__metric_forms[] = {
+    {sizeof(gsf__lpips), gsf__lpips_open_metric, gsf__lpips_measure, gsf__lpips_close},
+    {sizeof(gsf__lpips), gsf__lpips_open_metric, gsf__lpips_measure, gsf__lpips_close},
+    {sizeof(gsf__lpips), gsf__lpips_open_metric, gsf__lpips_measure, gsf__lpips_close},
+    {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
+    {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
+};
 
 static gsf_result gsf__metric_open(gsf_context* ctx, gsf_nn_metric* metric) {
     if (metric->state) return GSF_OK;
-    if ((int)metric->kind < 0 || metric->kind > GSF_NN_METRIC_LPIPS_SQUEEZE || !metric->models)
+    if ((int)metric->kind < 0 || (size_t)metric->kind >= GSF__COUNT(gsf__metric_forms) || !metric->models)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "metric %d: no such kind, or no folder of models", (int)metric->kind);
-    metric->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__lpips));
+    const struct gsf__metric_form* form = &gsf__metric_forms[metric->kind];
+    metric->state = gsf_alloc_zeroed(ctx, 1, form->size);
     if (!metric->state) return GSF_ERROR_OUT_OF_MEMORY;
-    const gsf_result result = gsf__lpips_open(ctx, metric->models, (int)metric->kind, (gsf__lpips*)metric->state);
+    const gsf_result result = form->open(ctx, metric, metric->state);
     if (result) {
-        gsf__lpips_close(ctx, (gsf__lpips*)metric->state);
+        form->close(ctx, metric->state);
         gsf_free(ctx, metric->state);
         metric->state = NULL;
     }
@@ -14554,22 +14966,21 @@ static gsf_result gsf__metric_open(gsf_context* ctx, gsf_nn_metric* metric) {
 
 GSF_API gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
                                         const gsf_image* reference) {
-    double value;
     GSF__TRY(gsf__metric_open(ctx, metric));
     if (!frame) return GSF_OK;
-    const char* name = gsf__lpips_nets[metric->kind].name;
-    if (!reference || frame->channels != 3 || reference->channels != 3 || frame->width != reference->width ||
-        frame->height != reference->height)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: two images of one size with three channels are needed", name);
-    GSF__TRY(gsf__lpips_measure(ctx, metric, frame, reference, &value));
-    if (!(fabs(value) <= DBL_MAX)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: the distance is %g", name, value);
-    metric->last = value;
-    metric->score += (value - metric->score) / (double)++metric->count;
-    return GSF_OK;
+    for (int i = 0; i < 2; i++) {
+        const gsf_image* image = i ? reference : frame;
+        if (!image) continue;
+        if (!image->data || image->width < 1 || image->height < 1 || image->channels != 3)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "metric: a %s of %lld x %lld with %d channels",
+                            i ? "reference" : "frame", (long long)image->width, (long long)image->height,
+                            (int)image->channels);
+    }
+    return gsf__metric_forms[metric->kind].measure(ctx, metric, frame, reference);
 }
 
 GSF_API void gsf_nn_destroy_metric(gsf_context* ctx, gsf_nn_metric* metric) {
-    if (metric->state) gsf__lpips_close(ctx, (gsf__lpips*)metric->state);
+    if (metric->state) gsf__metric_forms[metric->kind].close(ctx, metric->state);
     gsf_free(ctx, metric->state);
     memset(metric, 0, sizeof *metric);
 }
@@ -14646,6 +15057,7 @@ static double gsf__nn_activation_slope(gsf__nn_activation activation, double x) 
         case GSF__NN_GELU:
             return 0.5 * erfc(-0.7071067811865476 * x) + x * exp(-0.5 * x * x) * 0.3989422804014327;
         case GSF__NN_RELU: return x > 0.0 ? 1.0 : 0.0;
+        case GSF__NN_QUICK_GELU: return gsf__nn_activation_slope(GSF__NN_SILU, 1.702 * x);
     }
     return 1.0;
 }
@@ -14882,7 +15294,8 @@ GSF__V_INLINE gsf__vf gsf__v_slope(gsf__nn_activation activation, gsf__vf x) {
         const gsf__vf du = gsf__v_madd(square, gsf__v_set(0.214070916f), gsf__v_set(1.59576912f));
         return gsf__v_madd(v * du, s * t, s);
     }
-    if (activation == GSF__NN_SILU) {
+    if (activation == GSF__NN_QUICK_GELU) x = gsf__v_set(1.702f) * x; // the same slope as that of SiLU there
+    if (activation == GSF__NN_SILU || activation == GSF__NN_QUICK_GELU) {
         const gsf__vf v = gsf__v_min(gsf__v_set(80.0f), gsf__v_max(gsf__v_set(-80.0f), x));
         const gsf__vf power = gsf__v_exp(zero - v), s = one / (one + power);
         return gsf__v_madd(v * s, power * s, s);
@@ -14915,6 +15328,7 @@ GSF__V_KERNEL void GSF__V(gsf__activate_grad)(gsf__nn_activation activation, con
         GSF_X(GSF__NN_SILU)
         GSF_X(GSF__NN_GELU)
         GSF_X(GSF__NN_RELU)
+        GSF_X(GSF__NN_QUICK_GELU)
     }
 #undef GSF_X
 }

@@ -124,7 +124,8 @@ static const option_spec option_specs[] = {
      "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage; with --models lpips_alex, lpips_vgg, lpips_squeeze on images in\n"
-     "[-1,1], lpips_alex_raw ... on images in [0,1] (default psnr,ssim_3dgs)"},
+     "[-1,1], lpips_alex_raw ... on images in [0,1]; i2v_subject, i2v_background: DIR_A as a clip, against the first picture\n"
+     "of DIR_B (default psnr,ssim_3dgs)"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
@@ -910,29 +911,63 @@ static int run_path(gsfix_app* app) {
 
 // ---- metrics ---------------------------------------------------------------------
 
-static const char* const metric_names[] = {"psnr", "ssim_3dgs", "ssim_torchmetrics", "ssim_skimage", "lpips_alex", "lpips_vgg",
-                                           "lpips_squeeze", "lpips_alex_raw", "lpips_vgg_raw", "lpips_squeeze_raw"};
-enum { METRIC_COUNT = 10, PIXEL_METRICS = 4, LPIPS_NETS = 3 };
+typedef struct metric_spec {
+    const char* name;
+    int net;      // a gsf_nn_metric_kind, or one of those below
+    int raw, clip; // for LPIPS; measures DIR_A as a clip
+} metric_spec;
 
-static gsf_result measure(gsf_context* ctx, int metric, gsf_nn_metric* net, const gsf_image* a, const gsf_image* b,
+enum { PSNR = -4, SSIM_3DGS, SSIM_TORCHMETRICS, SSIM_SKIMAGE }; // values of `net`
+static const metric_spec metric_specs[] = {
+    {"psnr", PSNR, 0, 0},
+    {"ssim_3dgs", SSIM_3DGS, 0, 0},
+    {"ssim_torchmetrics", SSIM_TORCHMETRICS, 0, 0},
+    {"ssim_skimage", SSIM_SKIMAGE, 0, 0},
+    {"lpips_alex", GSF_NN_METRIC_LPIPS_ALEX, 0, 0},
+    {"lpips_vgg", GSF_NN_METRIC_LPIPS_VGG, 0, 0},
+    {"lpips_squeeze", GSF_NN_METRIC_LPIPS_SQUEEZE, 0, 0},
+    {"lpips_alex_raw", GSF_NN_METRIC_LPIPS_ALEX, 1, 0},
+    {"lpips_vgg_raw", GSF_NN_METRIC_LPIPS_VGG, 1, 0},
+    {"lpips_squeeze_raw", GSF_NN_METRIC_LPIPS_SQUEEZE, 1, 0},
+    {"i2v_subject", GSF_NN_METRIC_I2V_SUBJECT, 0, 1},
+    {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND, 0, 1},
+};
+enum { METRIC_COUNT = sizeof metric_specs / sizeof *metric_specs };
+
+typedef struct metric_run {
+    int wanted[METRIC_COUNT];
+    gsf_nn_metric nets[METRIC_COUNT]; // of the metrics that need a network
+} metric_run;
+
+// Of a pair of images. Masks apply to the metrics of pixels only.
+static int measures_pair(const metric_run* run, int m, int seen) {
+    return run->wanted[m] && !metric_specs[m].clip && (!seen || metric_specs[m].net < 0);
+}
+
+static gsf_result measure(gsf_context* ctx, metric_run* run, int m, const gsf_image* a, const gsf_image* b,
                           const gsf_image* mask, double* out) {
-    if (metric == 0) return gsf_measure_psnr(ctx, a, b, mask, out);
-    static const gsf_ssim_kind kinds[] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
-    if (metric < PIXEL_METRICS) return gsf_measure_ssim(ctx, kinds[metric - 1], a, b, mask, out);
-    const gsf_result result = gsf_nn_measure_frame(ctx, net, a, b);
-    *out = net->last;
-    return result;
+    gsf_result result;
+    switch (metric_specs[m].net) {
+        case PSNR: return gsf_measure_psnr(ctx, a, b, mask, out);
+        case SSIM_3DGS: return gsf_measure_ssim(ctx, GSF_SSIM_3DGS, a, b, mask, out);
+        case SSIM_TORCHMETRICS: return gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, a, b, mask, out);
+        case SSIM_SKIMAGE: return gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, a, b, mask, out);
+        default:
+            result = gsf_nn_measure_frame(ctx, &run->nets[m], a, b);
+            *out = run->nets[m].last;
+            return result;
+    }
 }
 
 // Opens the networks of the wanted metrics, so that a missing file is reported before any work.
-static gsf_result open_networks(gsfix_app* app, const int* wanted, gsf_nn_metric* nets) {
+static gsf_result open_networks(gsfix_app* app, metric_run* run) {
     gsf_result result = GSF_OK;
-    for (int m = PIXEL_METRICS; m < METRIC_COUNT && result == GSF_OK; m++) {
-        if (!wanted[m]) continue;
-        nets[m].kind = (gsf_nn_metric_kind)(GSF_NN_METRIC_LPIPS_ALEX + (m - PIXEL_METRICS) % LPIPS_NETS);
-        nets[m].raw = m >= PIXEL_METRICS + LPIPS_NETS;
-        nets[m].models = app->o.models;
-        result = gsf_nn_measure_frame(&app->ctx, &nets[m], NULL, NULL);
+    for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
+        if (!run->wanted[m] || metric_specs[m].net < 0) continue;
+        run->nets[m].kind = (gsf_nn_metric_kind)metric_specs[m].net;
+        run->nets[m].raw = metric_specs[m].raw;
+        run->nets[m].models = app->o.models;
+        result = gsf_nn_measure_frame(&app->ctx, &run->nets[m], NULL, NULL);
     }
     return result;
 }
@@ -943,7 +978,7 @@ typedef struct metric_sums { // [0]: over all pixels, [1]: over those of the mas
 } metric_sums;
 
 static const char* metric_name(int metric, int seen, gsfix_path* name) {
-    *name = gsfix_pathf("%s%s", metric_names[metric], seen ? "_seen" : "");
+    *name = gsfix_pathf("%s%s", metric_specs[metric].name, seen ? "_seen" : "");
     return name->s;
 }
 
@@ -956,8 +991,8 @@ static gsf_result load_pair_mask(gsfix_app* app, const char* stem, gsf_image* ma
     return result;
 }
 
-static gsf_result compare_pair(gsfix_app* app, const int* wanted, gsf_nn_metric* nets, const char* stem, const char* left,
-                               const char* right, metric_sums* total) {
+static gsf_result compare_pair(gsfix_app* app, metric_run* run, const char* stem, const char* left, const char* right,
+                               metric_sums* total) {
     gsf_context* ctx = &app->ctx;
     gsf_image x = {0}, y = {0}, mask = {0};
     char line[256] = "";
@@ -976,8 +1011,8 @@ static gsf_result compare_pair(gsfix_app* app, const int* wanted, gsf_nn_metric*
         for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
             double value = 0.0;
             gsfix_path name;
-            if (!wanted[m] || (seen && m >= PIXEL_METRICS)) continue;
-            result = measure(ctx, m, &nets[m], &x, &y, seen ? &mask : NULL, &value);
+            if (!measures_pair(run, m, seen)) continue;
+            result = measure(ctx, run, m, &x, &y, seen ? &mask : NULL, &value);
             if (result != GSF_OK) break;
             total->sums[seen][m] += value;
             gsfix_json_number(ctx, &app->json, metric_name(m, seen, &name), value);
@@ -995,70 +1030,104 @@ static gsf_result compare_pair(gsfix_app* app, const int* wanted, gsf_nn_metric*
     return result;
 }
 
-static void print_means(gsfix_app* app, const int* wanted, const metric_sums* total) {
+static void print_means(gsfix_app* app, const metric_run* run, const metric_sums* total) {
     for (int seen = 0; seen < 2; seen++) {
         if (!total->pairs[seen]) continue;
         gsfix_print(app, "means of %zu pairs%s:", total->pairs[seen], seen ? ", where the masks are white" : "");
         for (int m = 0; m < METRIC_COUNT; m++) {
             const double mean = total->sums[seen][m] / (double)total->pairs[seen];
             gsfix_path name;
-            if (!wanted[m] || (seen && m >= PIXEL_METRICS)) continue;
+            if (!measures_pair(run, m, seen)) continue;
             gsfix_json_number(&app->ctx, &app->json, metric_name(m, seen, &name), mean);
             gsfix_print(app, "  %-22s %.5f", name.s, mean);
         }
     }
 }
 
-static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
+// Passes the pictures of DIR_A, in the order of their names, to the networks that measure clips, with DIR_B's first picture
+// as the input image.
+static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_names* left, const gsfix_names* right) {
+    gsf_context* ctx = &app->ctx;
+    int clips = 0;
+    gsf_result result = GSF_OK;
+    gsf_image input = {0}, frame = {0};
+    for (int m = 0; m < METRIC_COUNT; m++) clips += run->wanted[m] && metric_specs[m].clip;
+    if (!clips) return GSF_OK;
+    if (!left->count || !right->count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has no pictures", app->o.inputs[left->count ? 1 : 0]);
+    result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[1], right->names[0]).s, 3, &input);
+    for (size_t i = 0; i < left->count && result == GSF_OK; i++) {
+        result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[0], left->names[i]).s, 3, &frame);
+        for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++)
+            if (run->wanted[m] && metric_specs[m].clip) result = gsf_nn_measure_frame(ctx, &run->nets[m], &frame, &input);
+        gsf_destroy_image(ctx, &frame);
+        gsfix_progress(app, (double)(i + 1), (double)left->count, "frame %zu of %zu", i + 1, left->count);
+    }
+    gsf_destroy_image(ctx, &input);
+    if (result != GSF_OK) return result;
+    gsfix_print(app, "clip of %zu frames:", left->count);
+    for (int m = 0; m < METRIC_COUNT; m++) {
+        if (!run->wanted[m] || !metric_specs[m].clip) continue;
+        gsfix_json_number(ctx, &app->json, metric_specs[m].name, run->nets[m].score);
+        gsfix_print(app, "  %-22s %.5f", metric_specs[m].name, run->nets[m].score);
+    }
+    return result;
+}
+
+static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
     gsf_context* ctx = &app->ctx;
     const char *a = app->o.inputs[0], *b = app->o.inputs[1];
     gsfix_names left = {0}, right = {0};
     metric_sums total = {0};
-    gsf_nn_metric nets[METRIC_COUNT] = {0};
-    gsf_result result = open_networks(app, wanted, nets);
+    int by_pair = 0;
+    gsf_result result = open_networks(app, run);
+    for (int m = 0; m < METRIC_COUNT; m++) by_pair |= measures_pair(run, m, 0);
     if (result == GSF_OK) result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
     if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
     gsfix_json_begin(ctx, &app->json, "per_image", '[');
-    for (size_t i = 0; i < left.count && result == GSF_OK; i++) {
+    for (size_t i = 0; i < left.count && result == GSF_OK && by_pair; i++) {
         const gsfix_path stem = gsfix_stem(left.names[i]);
         size_t k = 0;
         while (k < right.count && strcmp(gsfix_stem(right.names[k]).s, stem.s) != 0) k++;
         if (k < right.count)
-            result = compare_pair(app, wanted, nets, stem.s, gsfix_pathf("%s/%s", a, left.names[i]).s,
+            result = compare_pair(app, run, stem.s, gsfix_pathf("%s/%s", a, left.names[i]).s,
                                   gsfix_pathf("%s/%s", b, right.names[k]).s, &total);
     }
     gsfix_json_end(ctx, &app->json, ']');
     const size_t pairs = total.pairs[0], unpaired = left.count + right.count - 2 * pairs;
-    if (result == GSF_OK && !pairs)
+    if (result == GSF_OK && !pairs && by_pair)
         result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s and %s have no picture of the same name", a, b);
-    if (result == GSF_OK) {
+    if (result == GSF_OK && by_pair) {
         gsfix_json_number(ctx, &app->json, "pairs", (double)pairs);
         gsfix_json_number(ctx, &app->json, "unpaired", (double)unpaired);
-        print_means(app, wanted, &total);
+        print_means(app, run, &total);
         if (unpaired) gsfix_note(app, "note: %zu pictures have no partner", unpaired);
     }
-    for (int m = PIXEL_METRICS; m < METRIC_COUNT; m++) gsf_nn_destroy_metric(ctx, &nets[m]);
+    if (result == GSF_OK) result = measure_clip(app, run, &left, &right);
+    for (int m = 0; m < METRIC_COUNT; m++) gsf_nn_destroy_metric(ctx, &run->nets[m]);
     gsfix_free_names(ctx, &left);
     gsfix_free_names(ctx, &right);
     return result;
 }
 
 static int run_metrics(gsfix_app* app) {
-    int wanted[METRIC_COUNT] = {0}, nets = 0;
+    metric_run run = {0};
+    int nets = 0;
     const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
-        while (m < METRIC_COUNT && !(strlen(metric_names[m]) == n && strncmp(metric_names[m], p, n) == 0)) m++;
+        while (m < METRIC_COUNT && !(strlen(metric_specs[m].name) == n && strncmp(metric_specs[m].name, p, n) == 0)) m++;
         if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
-        if (m >= PIXEL_METRICS && !app->o.models) return gsfix_misused(app, "%s needs --models", metric_names[m]);
-        wanted[m] = 1;
-        nets += m >= PIXEL_METRICS;
+        if (metric_specs[m].net >= 0 && !app->o.models)
+            return gsfix_misused(app, "%s needs --models", metric_specs[m].name);
+        run.wanted[m] = 1;
+        nets += metric_specs[m].net >= 0;
         p += n;
         if (!*p) break;
     }
     if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
-    return compare_folders(app, wanted) == GSF_OK ? 0 : gsfix_failed(app);
+    return compare_folders(app, &run) == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- masks -----------------------------------------------------------------------

@@ -4,7 +4,7 @@
 
 #include <math.h>
 
-enum { ACTIVATION_COUNT = GSF__NN_RELU + 1 }; // tests loop over all of them
+enum { ACTIVATION_COUNT = GSF__NN_QUICK_GELU + 1 }; // tests loop over all of them
 
 static double activation_of(gsf__nn_activation activation, double x) {
     switch (activation) {
@@ -13,6 +13,7 @@ static double activation_of(gsf__nn_activation activation, double x) {
         case GSF__NN_SILU: return x / (1.0 + exp(-x));
         case GSF__NN_GELU: return 0.5 * x * erfc(-x / sqrt(2.0));
         case GSF__NN_RELU: return x < 0.0 ? 0.0 : x;
+        case GSF__NN_QUICK_GELU: return x / (1.0 + exp(-1.702 * x));
     }
     return NAN; // not added here yet
 }

@@ -6,9 +6,13 @@
 #include "test.h"
 #include "test_hooks.h"
 
+#include "metricnets_golden.h"
+#include "metricnets_i2v.h"
 #include "metricnets_pth.h"
 
 int main(void) {
     check_pth();
+    check_dino();
+    check_dreamsim();
     return test_report();
 }
