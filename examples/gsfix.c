@@ -1053,8 +1053,9 @@ static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_name
     gsf_image input = {0}, frame = {0};
     for (int m = 0; m < METRIC_COUNT; m++) clips += run->wanted[m] && metric_specs[m].clip;
     if (!clips) return GSF_OK;
-    if (!left->count || !right->count)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has no pictures", app->o.inputs[left->count ? 1 : 0]);
+    if (left->count < 2 || !right->count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has %s", app->o.inputs[left->count < 2 ? 0 : 1],
+                        left->count < 2 ? "fewer than two pictures: not a clip" : "no pictures");
     result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[1], right->names[0]).s, 3, &input);
     for (size_t i = 0; i < left->count && result == GSF_OK; i++) {
         result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[0], left->names[i]).s, 3, &frame);
