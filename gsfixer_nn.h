@@ -15029,6 +15029,7 @@ typedef struct gsf__grad_kernels {
     void (*norm)(const gsf__grad_job* job, int64_t row, float* sums, float* products);
     void (*sum)(const gsf__grad_job* job, int64_t row, float* sums, float* products); // of dy, and of dy x unless x is NULL
     void (*scale)(const float* x, const float* y, int64_t count, float* out); // out = x y
+    void (*add_product)(const float* x, const float* y, int64_t count, float* out); // out += x y
     // y = the sum of weight[k] * row at[k] of x or, with `add`, y += that; x (any, channels)
     void (*gather)(const int32_t* at, const float* weight, int64_t taps, const float* x, int64_t channels, int add, float* y);
     // Rotates pairs back: dx = dy turned by the negative angles; dx may be dy
@@ -15212,6 +15213,14 @@ GSF__V_KERNEL void GSF__V(gsf__scale_row)(const float* x, const float* y, int64_
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__add_product)(const float* x, const float* y, int64_t count, float* out) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf before = gsf__v_load_first(out + i, left);
+        gsf__v_store_first(out + i, gsf__v_madd(gsf__v_load_first(x + i, left), gsf__v_load_first(y + i, left), before), left);
+    }
+}
+
 GSF__V_KERNEL void GSF__V(gsf__gather_row)(const int32_t* at, const float* weight, int64_t taps, const float* x,
                                            int64_t channels, int add, float* y) {
     for (int64_t i = 0; i < channels; i += GSF__LANES) {
@@ -15353,17 +15362,20 @@ GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int
 static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
     static const gsf__grad_kernels scalar = {
         gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar, gsf__norm_grad_row_scalar,
-        gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__gather_row_scalar, gsf__rope_grad_scalar,
-        gsf__channel_sums_scalar, gsf__channel_grad_scalar, gsf__adam_scalar, gsf__attention_grad_row_scalar};
+        gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__add_product_scalar, gsf__gather_row_scalar,
+        gsf__rope_grad_scalar, gsf__channel_sums_scalar, gsf__channel_grad_scalar, gsf__adam_scalar,
+        gsf__attention_grad_row_scalar};
 #if GSF__X86
     static const gsf__grad_kernels avx2 = {
         gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2, gsf__norm_grad_row_avx2,
-        gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__gather_row_avx2, gsf__rope_grad_avx2,
-        gsf__channel_sums_avx2, gsf__channel_grad_avx2, gsf__adam_avx2, gsf__attention_grad_row_avx2};
+        gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__add_product_avx2, gsf__gather_row_avx2,
+        gsf__rope_grad_avx2, gsf__channel_sums_avx2, gsf__channel_grad_avx2, gsf__adam_avx2,
+        gsf__attention_grad_row_avx2};
     static const gsf__grad_kernels avx512 = {
         gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512, gsf__norm_grad_row_avx512,
-        gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__gather_row_avx512, gsf__rope_grad_avx512,
-        gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__adam_avx512, gsf__attention_grad_row_avx512};
+        gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__add_product_avx512, gsf__gather_row_avx512,
+        gsf__rope_grad_avx512, gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__adam_avx512,
+        gsf__attention_grad_row_avx512};
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
@@ -16036,6 +16048,130 @@ GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_gr
     return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * g.width, g.layer.out, d->dbias) : GSF_OK;
 }
 
+// ---- training: depthwise convolution
+
+typedef struct gsf__nn_depthwise { // k x k, k odd, zeros around the image; forward and backward
+    const float* x;            // (frames, height, width, channels)
+    int64_t frames, height, width, channels, kernel;
+    const float *weight, *bias; // (channels, 1, k, k), as PyTorch stores it; (channels) or NULL
+    float* y;                  // forward: as x
+    const float* dy;           // backward
+    float *dx, *dweight, *dbias; // as x; as weight and bias, added to; each may be NULL
+} gsf__nn_depthwise;
+
+typedef struct gsf__depthwise_job {
+    const gsf__grad_kernels* kernels;
+    gsf__nn_depthwise desc;
+    const float *from, *weights; // (k^2, channels)
+    float *to, *shorts;          // shorts: per worker, (2, channels)
+    double* sums;                // (bands, k^2, channels)
+    int64_t bands, band_rows;
+} gsf__depthwise_job;
+
+// (k^2, channels) from (channels, k^2), mirrored for the backward pass
+static void gsf__depthwise_pack(const gsf__nn_depthwise* d, int mirrored, float* out) {
+    const int64_t taps = d->kernel * d->kernel;
+    for (int64_t t = 0; t < taps; t++)
+        for (int64_t c = 0; c < d->channels; c++)
+            out[(mirrored ? taps - 1 - t : t) * d->channels + c] = d->weight[c * taps + t];
+}
+
+static void gsf__depthwise_row(void* arg, size_t row, int32_t worker) {
+    const gsf__depthwise_job* job = (const gsf__depthwise_job*)arg;
+    const gsf__nn_depthwise* d = &job->desc;
+    const int64_t h = d->height, w = d->width, c = d->channels, half = d->kernel / 2, y = (int64_t)row % h;
+    (void)worker;
+    for (int64_t x = 0; x < w; x++) {
+        float* to = job->to + ((int64_t)row * w + x) * c;
+        if (d->bias && job->to == d->y) memcpy(to, d->bias, (size_t)c * sizeof(float));
+        else memset(to, 0, (size_t)c * sizeof(float));
+        for (int64_t t = 0; t < d->kernel * d->kernel; t++) {
+            const int64_t sy = y + t / d->kernel - half, sx = x + t % d->kernel - half;
+            if (sy < 0 || sy >= h || sx < 0 || sx >= w) continue;
+            job->kernels->add_product(job->weights + t * c, job->from + (((int64_t)row - y + sy) * w + sx) * c, c, to);
+        }
+    }
+}
+
+static gsf_result gsf__depthwise_run(gsf_context* ctx, const gsf__nn_depthwise* d, const float* from, int mirrored, float* to) {
+    gsf__depthwise_job job;
+    memset(&job, 0, sizeof job);
+    float* weights = (float*)gsf_alloc(ctx, (size_t)(d->kernel * d->kernel), (size_t)d->channels * sizeof(float));
+    if (!weights) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__depthwise_pack(d, mirrored, weights);
+    job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+    job.desc = *d;
+    job.from = from;
+    job.to = to;
+    job.weights = weights;
+    gsf__parallel_for(ctx, (size_t)(d->frames * d->height), gsf__depthwise_row, &job);
+    gsf_free(ctx, weights);
+    return GSF_OK;
+}
+
+static gsf_result gsf__check_depthwise(gsf_context* ctx, const gsf__nn_depthwise* d) {
+    if (d->x && d->weight && d->frames > 0 && d->height > 0 && d->width > 0 && d->channels > 0 && d->kernel > 0 &&
+        d->kernel % 2 == 1)
+        return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "depthwise convolution: x, weight or a size is missing, or k is even");
+}
+
+GSF__SHARED gsf_result gsf__nn_depthwise_forward(gsf_context* ctx, const gsf__nn_depthwise* d) {
+    GSF__TRY(gsf__check_depthwise(ctx, d));
+    return gsf__depthwise_run(ctx, d, d->x, 0, d->y);
+}
+
+// A chunk is one band of rows and one tap: per channel, the sum of x dy over the pixels that the tap sees.
+static void gsf__depthwise_grad_weight(void* arg, size_t chunk, int32_t worker) {
+    const gsf__depthwise_job* job = (const gsf__depthwise_job*)arg;
+    const gsf__nn_depthwise* d = &job->desc;
+    const int64_t taps = d->kernel * d->kernel, tap = (int64_t)chunk % taps, band = (int64_t)chunk / taps, c = d->channels;
+    const int64_t dx = tap % d->kernel - d->kernel / 2, dy = tap / d->kernel - d->kernel / 2;
+    const int64_t x0 = dx < 0 ? -dx : 0, x1 = dx > 0 ? d->width - dx : d->width;
+    const int64_t end = gsf__least((band + 1) * job->band_rows, d->frames * d->height);
+    double* sums = job->sums + (int64_t)chunk * c;
+    float* part = job->shorts + worker * c;
+    memset(sums, 0, (size_t)c * sizeof(double));
+    for (int64_t r = band * job->band_rows; r < end; r++) {
+        if (r % d->height + dy < 0 || r % d->height + dy >= d->height) continue;
+        for (int64_t first = x0; first < x1; first += GSF__GRAD_SHORT) {
+            memset(part, 0, (size_t)c * sizeof(float));
+            for (int64_t x = first; x < first + GSF__GRAD_SHORT && x < x1; x++)
+                job->kernels->add_product(d->x + ((r + dy) * d->width + x + dx) * c, d->dy + (r * d->width + x) * c, c, part);
+            for (int64_t i = 0; i < c; i++) sums[i] += (double)part[i];
+        }
+    }
+}
+
+enum { GSF__DEPTHWISE_BANDS = 16 };
+
+GSF__SHARED gsf_result gsf__nn_depthwise_backward(gsf_context* ctx, const gsf__nn_depthwise* d) {
+    GSF__TRY(gsf__check_depthwise(ctx, d));
+    const int64_t rows = d->frames * d->height, taps = d->kernel * d->kernel, c = d->channels;
+    if (d->dx) GSF__TRY(gsf__depthwise_run(ctx, d, d->dy, 1, d->dx));
+    if (d->dweight) {
+        gsf__depthwise_job job;
+        memset(&job, 0, sizeof job);
+        job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+        job.desc = *d;
+        job.band_rows = gsf__ceil_div(rows, GSF__DEPTHWISE_BANDS);
+        job.bands = gsf__ceil_div(rows, job.band_rows);
+        const size_t sums = (size_t)(job.bands * taps); // then of each worker, two floats in the place of a double
+        job.sums = (double*)gsf_alloc(ctx, sums + (size_t)ctx->parallel.worker_count, (size_t)c * sizeof(double));
+        if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
+        job.shorts = (float*)(void*)(job.sums + sums * (size_t)c);
+        gsf__parallel_for(ctx, sums, gsf__depthwise_grad_weight, &job);
+        for (int64_t i = 0; i < c; i++)
+            for (int64_t t = 0; t < taps; t++) {
+                double sum = 0.0;
+                for (int64_t band = 0; band < job.bands; band++) sum += job.sums[(band * taps + t) * c + i];
+                d->dweight[i * taps + t] += (float)sum;
+            }
+        gsf_free(ctx, job.sums);
+    }
+    return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * d->width, c, d->dbias) : GSF_OK;
+}
+
 // ---- training: resampling and warping
 
 /* Layers of image networks, forward and backward; images are channels-last. Resampling and warping are sparse matrices
@@ -16392,6 +16528,96 @@ GSF__SHARED gsf_result gsf__nn_step_adam(gsf_context* ctx, gsf__nn_params* param
     job.terms.average = (float)(1.0 - d->average);
     gsf__parallel_for(ctx, gsf__nn_chunks(params->count, GSF__NN_CHUNK), gsf__adam_chunk, &job);
     return GSF_OK;
+}
+
+// ---- training: parameters in files
+
+/* The network's tensors under their own names, trained ones in float32; for a later resume also Adam's moments and the
+   moving average, as optimizer.m.NAME, optimizer.v.NAME, average.NAME and optimizer.step. */
+typedef enum gsf__nn_saved { GSF__NN_SAVE_VALUES = 0, GSF__NN_SAVE_AVERAGE, GSF__NN_SAVE_STATE } gsf__nn_saved;
+
+static const char* const gsf__nn_state_names[4] = {"", "optimizer.m.", "optimizer.v.", "average."};
+
+enum { GSF__NN_STATE_NAME = 16 }; // more than the longest of them
+
+static float* gsf__nn_state_of(const gsf__nn_params* p, int kind) {
+    return kind == 0 ? p->value : kind == 1 ? p->m : kind == 2 ? p->v : p->average;
+}
+
+// what AVERAGE: the moving average in the place of the values, to use the network with
+GSF__SHARED gsf_result gsf__nn_save_params(gsf_context* ctx, const gsf__nn_params* params, gsf__nn_saved what,
+                                           const char* path) {
+    const size_t tensors = params->weights->tensor_count;
+    const int kinds = what != GSF__NN_SAVE_STATE ? 1 : params->average ? 4 : 3;
+    size_t names = 0, used = 0, count = 0;
+    if (what == GSF__NN_SAVE_AVERAGE && !params->average)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: there is no moving average to save", path);
+    for (size_t i = 0; i < tensors; i++) names += 4 * (strlen(params->weights->tensors[i].name) + GSF__NN_STATE_NAME);
+    gsf_nn_tensor* all = (gsf_nn_tensor*)gsf_alloc_zeroed(ctx, 4 * tensors + 1, sizeof *all);
+    char* text = all ? (char*)gsf_alloc(ctx, names + 1, 1) : NULL;
+    if (!text) {
+        gsf_free(ctx, all);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    for (int kind = 0; kind < kinds; kind++)
+        for (size_t i = 0; i < tensors; i++) {
+            const float* from = what == GSF__NN_SAVE_AVERAGE ? params->average : gsf__nn_state_of(params, kind);
+            if (kind && params->at[i] < 0) continue;
+            gsf_nn_tensor* t = &all[count++];
+            *t = params->weights->tensors[i];
+            if (params->at[i] >= 0) t->data = from + params->at[i];
+            t->name = text + used;
+            used += 1 + (size_t)snprintf(text + used, names + 1 - used, "%s%s", gsf__nn_state_names[kind],
+                                         params->weights->tensors[i].name);
+        }
+    if (what == GSF__NN_SAVE_STATE) {
+        gsf_nn_tensor* t = &all[count++];
+        t->name = "optimizer.step";
+        t->data = &params->step;
+        t->dtype = GSF_NN_I64;
+        t->count = 1;
+    }
+    const gsf_result result = gsf_nn_save_tensors(ctx, path, all, count);
+    gsf_free(ctx, text);
+    gsf_free(ctx, all);
+    return result;
+}
+
+static gsf_result gsf__nn_read_state(gsf_context* ctx, const gsf_nn_weights* file, gsf__nn_params* params, int copy) {
+    for (int kind = 0; kind < (params->average ? 4 : 3); kind++)
+        for (size_t i = 0; i < params->weights->tensor_count; i++) {
+            const gsf_nn_tensor* mine = &params->weights->tensors[i];
+            char name[512];
+            if (params->at[i] < 0) continue;
+            snprintf(name, sizeof name, "%s%s", gsf__nn_state_names[kind], mine->name);
+            const gsf_nn_tensor* t = gsf_nn_find_tensor(file, name);
+            if (!t || t->dtype != GSF_NN_F32 || t->rank != mine->rank ||
+                memcmp(t->shape, mine->shape, sizeof t->shape) != 0)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is %s", file->name, name,
+                                t ? "not float32 of the network's shape" : "missing");
+            if (copy) gsf_nn_convert_tensor(t, 0, t->count, gsf__nn_state_of(params, kind) + params->at[i]);
+        }
+    return GSF_OK;
+}
+
+// Continues from a file saved with STATE: the same bits as without the interruption. On error nothing is changed.
+GSF__SHARED gsf_result gsf__nn_load_params(gsf_context* ctx, gsf__nn_params* params, const char* path) {
+    gsf_nn_weights file;
+    int64_t count = 0;
+    GSF__TRY(gsf_nn_load_weights(ctx, path, NULL, &file));
+    const gsf_nn_tensor* step = gsf_nn_find_tensor(&file, "optimizer.step");
+    gsf_result result = GSF_OK;
+    if (step && step->dtype == GSF_NN_I64 && step->count == 1) memcpy(&count, step->data, sizeof count);
+    else count = -1;
+    if (count < 0) result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor optimizer.step is missing or no step", file.name);
+    if (!result) result = gsf__nn_read_state(ctx, &file, params, 0);
+    if (!result) result = gsf__nn_read_state(ctx, &file, params, 1);
+    if (!result) {
+        params->step = count;
+        memset(params->grad, 0, (size_t)params->count * sizeof(float));
+    }
+    gsf_nn_destroy_weights(ctx, &file);
+    return result;
 }
 
 // ---- training: the transformer

@@ -185,6 +185,101 @@ static void train(training* t, double losses[STEPS + 1], int compare) {
     test_free_tensor(&pred);
 }
 
+// Two updates in one go are those of one, a file, and one more.
+static void test_resume(gsf_context* ctx) {
+    const char* path = test_scratch("training.safetensors");
+    gsf__nn_adam_desc adam;
+    training whole, first, second;
+    double loss;
+    memset(&adam, 0, sizeof adam);
+    adam.lr = 1e-3;
+    adam.average = 0.9;
+    open_training(&whole, ctx);
+    open_training(&first, ctx);
+    open_training(&second, ctx);
+    for (int i = 0; i < 2; i++) {
+        CHECK_OK(ctx, gsf__nn_train_transformer(ctx, &whole.net, &whole.params, &whole.desc, &loss));
+        CHECK_OK(ctx, gsf__nn_step_adam(ctx, &whole.params, &adam, NULL));
+    }
+    CHECK_OK(ctx, gsf__nn_train_transformer(ctx, &first.net, &first.params, &first.desc, &loss));
+    CHECK_OK(ctx, gsf__nn_step_adam(ctx, &first.params, &adam, NULL));
+    CHECK_OK(ctx, gsf__nn_save_params(ctx, &first.params, GSF__NN_SAVE_STATE, path));
+    CHECK_OK(ctx, gsf__nn_load_params(ctx, &second.params, path));
+    CHECK(second.params.step == 1);
+    CHECK_OK(ctx, gsf__nn_train_transformer(ctx, &second.net, &second.params, &second.desc, &loss));
+    CHECK_OK(ctx, gsf__nn_step_adam(ctx, &second.params, &adam, NULL));
+    const size_t bytes = (size_t)whole.params.count * sizeof(float);
+    CHECK(memcmp(second.params.value, whole.params.value, bytes) == 0);
+    CHECK(memcmp(second.params.m, whole.params.m, bytes) == 0);
+    CHECK(memcmp(second.params.v, whole.params.v, bytes) == 0);
+    CHECK(memcmp(second.params.average, whole.params.average, bytes) == 0);
+    // as a model: the moving averages under the names and shapes of the network
+    gsf_nn_weights file;
+    CHECK_OK(ctx, gsf__nn_save_params(ctx, &whole.params, GSF__NN_SAVE_AVERAGE, path));
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, path, NULL, &file));
+    CHECK(file.tensor_count == whole.params.weights->tensor_count);
+    const gsf_nn_tensor *saved = gsf_nn_find_tensor(&file, "proj_out.weight");
+    const gsf_nn_tensor *mine = gsf_nn_find_tensor(whole.params.weights, "proj_out.weight");
+    CHECK(saved && memcmp(saved->data, whole.params.average + whole.params.at[mine - whole.params.weights->tensors],
+                          (size_t)mine->count * sizeof(float)) == 0);
+    gsf_nn_destroy_weights(ctx, &file);
+    CHECK_RESULT(ctx, gsf__nn_load_params(ctx, &second.params, path), GSF_ERROR_FORMAT); // it has no state
+    CHECK(memcmp(second.params.value, whole.params.value, bytes) == 0);
+    close_training(&whole);
+    close_training(&first);
+    close_training(&second);
+}
+
+// AdamW, clipping, a cosine and the mean of accumulated gradients in double, for sizes around a vector and a chunk.
+static void test_adam(gsf_context* ctx) {
+    static const int64_t sizes[] = {1, 7, 17, 33000};
+    uint64_t seed = 5;
+    for (size_t s = 0; s < GSF__COUNT(sizes); s++) {
+        const int64_t n = sizes[s];
+        gsf__nn_params p;
+        const gsf__nn_adam_desc d = {0.01, 0.8, 0.95, 1e-6, 0.1, s % 2 ? 0.5 : 0.0, 0.75, 2, 9, 4};
+        float* memory = (float*)calloc((size_t)(5 * n), sizeof(float));
+        double *x = (double*)calloc((size_t)(4 * n), sizeof(double)), *m = x + n, *v = m + n, *average = v + n;
+        memset(&p, 0, sizeof p);
+        p.count = n;
+        p.value = memory;
+        p.grad = p.value + n;
+        p.m = p.grad + n;
+        p.v = p.m + n;
+        p.average = p.v + n;
+        for (int64_t i = 0; i < n; i++) {
+            p.value[i] = p.average[i] = (float)test_random_in(&seed, -1, 1);
+            x[i] = average[i] = (double)p.value[i];
+        }
+        for (int step = 0; step < 10; step++) {
+            double square = 0.0, norm;
+            double* g = (double*)malloc((size_t)n * sizeof(double));
+            for (int64_t i = 0; i < n; i++) {
+                g[i] = (double)(p.grad[i] = (float)test_random_in(&seed, -3, 3)) / 4.0;
+                square += g[i] * g[i];
+            }
+            const double clip = s % 2 && sqrt(square) > 0.5 ? 0.5 / (sqrt(square) + 1e-6) : 1.0;
+            const double lr = step < 2 ? 0.01 * step / 2.0 : step >= 9 ? 0.0
+                            : 0.005 * (1.0 + cos(3.14159265358979 * (step - 2) / 7.0));
+            for (int64_t i = 0; i < n; i++) {
+                m[i] = 0.8 * m[i] + 0.2 * clip * g[i];
+                v[i] = 0.95 * v[i] + 0.05 * clip * g[i] * clip * g[i];
+                x[i] *= 1.0 - lr * 0.1;
+                x[i] -= lr * m[i] / (1.0 - pow(0.8, step + 1)) / (sqrt(v[i] / (1.0 - pow(0.95, step + 1))) + 1e-6);
+                average[i] = 0.75 * average[i] + 0.25 * x[i];
+            }
+            CHECK_OK(ctx, gsf__nn_step_adam(ctx, &p, &d, &norm));
+            CHECK_NEAR(norm, sqrt(square), 1e-6 * sqrt(square));
+            CHECK(p.grad[0] == 0.0f && p.grad[n - 1] == 0.0f);
+            free(g);
+        }
+        test_compare_floats("adam: values", p.value, x, (size_t)n, 1e-6);
+        test_compare_floats("adam: averages", p.average, average, (size_t)n, 1e-6);
+        free(memory);
+        free(x);
+    }
+}
+
 // Every failing allocation among the first, then some: an error without a leak. Refused models and examples.
 static void test_errors(void) {
     gsf_context ctx;
@@ -246,6 +341,14 @@ int main(void) {
     printf("loss %.6f %.6f %.6f %.6f\n", losses[0], losses[1], losses[2], losses[3]);
     close_training(&t);
     close_training(&again);
+    test_resume(&ctx);
+    for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) {
+        gsf_context at;
+        memset(&at, 0, sizeof at);
+        at.cpu_level = (gsf_cpu_level)level;
+        CHECK_OK(&at, gsf_init_context(&at));
+        test_adam(&at);
+    }
     test_errors();
     return test_report();
 }

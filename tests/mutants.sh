@@ -55,6 +55,8 @@ gsfixer_nn.h|golden_training|training: references get no gradient from the value
 gsfixer_nn.h|golden_training|training: the gates of text for the video|s/(t->dx \+ at, run->video, d, t->db \+ at,\s*t->dm \+) GSF__DIT_VIDEO_GATE/$1 GSF__DIT_TEXT_GATE/
 gsfixer_nn.h|golden_training|training: gradients are not clipped|s/job\.terms\.scale = \(float\)\(mean \* clip\)/job.terms.scale = (float)mean/
 gsfixer_nn.h|golden_training|training: weight decay goes through the moments' rate only|s/1\.0 - rate \* d->weight_decay/1.0 - 0.0 * d->weight_decay/
+gsfixer_nn.h|test_nn_gradients|gradients: depthwise kernels not mirrored|s/mirrored \? taps - 1 - t : t/t/
+gsfixer_nn.h|golden_training|training: a resumed run forgets its step|s/params->step = count;/params->step = 0;/
 gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(gsf__v_load_first\(dp \+ j, left\) - less\)/gsf__v_load_first(dp + j, left)/
 END
 }

@@ -1,6 +1,6 @@
 // Gradients of layers over heads, tables and images against central differences of the layers in double: head norm with
-// rotary embedding, gates, embeddings, group norm, convolutions, resampling, warping, pixel shuffle, blends. Odd sizes, all
-// instruction sets, bit-identical for any number of workers. Prints the worst relative L2 error of each layer.
+// rotary embedding, gates, embeddings, group norm, convolutions (also depthwise), resampling, warping, pixel shuffle, blends.
+// Odd sizes, all instruction sets, bit-identical for any number of workers. Prints the worst relative L2 error of each.
 #define GSF_NN_TRAINING
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -260,6 +260,49 @@ static void test_convolution(gsf_context* ctx) {
     }
 }
 
+// ---- depthwise: size: frames, height, width, channels, kernel. p: weight | bias | x. Forward results are compared, too.
+
+static void depthwise_forward(const layer* l, const double* p, double* y) {
+    const int64_t h = l->size[1], w = l->size[2], c = l->size[3], k = l->size[4];
+    const double *bias = p + c * k * k, *x = bias + c;
+    for (int64_t i = 0; i < l->outs; i++) {
+        const int64_t channel = i % c, px = i / c % w, py = i / c / w % h, frame = i / c / w / h;
+        double sum = bias[channel];
+        for (int64_t t = 0; t < k * k; t++) {
+            const int64_t sx = px + t % k - k / 2, sy = py + t / k - k / 2;
+            if (sx < 0 || sx >= w || sy < 0 || sy >= h) continue;
+            sum += p[channel * k * k + t] * x[((frame * h + sy) * w + sx) * c + channel];
+        }
+        y[i] = sum;
+    }
+}
+
+static gsf_result depthwise_backward(gsf_context* ctx, const layer* l, const float* p, const float* dy, float* grad) {
+    const int64_t *s = l->size, bias = s[3] * s[4] * s[4], x = bias + s[3];
+    float* y = (float*)malloc((size_t)l->outs * sizeof(float));
+    double* wide = (double*)malloc((size_t)(l->outs + l->params) * sizeof(double));
+    const gsf__nn_depthwise d = {p + x, s[0], s[1], s[2], s[3], s[4], p, p + bias, y, dy, grad + x, grad, grad + bias};
+    GSF__TRY(gsf__nn_depthwise_forward(ctx, &d));
+    for (int64_t i = 0; i < l->params; i++) wide[l->outs + i] = (double)p[i];
+    depthwise_forward(l, wide + l->outs, wide);
+    test_compare_floats("depthwise", y, wide, (size_t)l->outs, 1e-5);
+    free(y);
+    free(wide);
+    return gsf__nn_depthwise_backward(ctx, &d);
+}
+
+static void test_depthwise(gsf_context* ctx) {
+    static const int64_t sizes[][5] = {{1, 1, 1, 1, 1}, {1, 2, 3, 5, 3}, {2, 7, 40, 3, 3}, {1, 5, 6, 17, 5}, {3, 4, 2, 9, 7}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        layer l = {"depthwise convolution", depthwise_forward, depthwise_backward, 0, 0, {0}, 0, NULL, NULL, NULL};
+        memcpy(l.size, sizes[i], sizeof sizes[0]);
+        const int64_t* s = l.size;
+        l.outs = s[0] * s[1] * s[2] * s[3];
+        l.params = l.outs + s[3] * (s[4] * s[4] + 1);
+        check(ctx, &l);
+    }
+}
+
 // ---- resampling: size: height, width, new height, new width, channels. option 0: nearest, 1: bilinear, 2: warp by
 // `cos`. p: x. Forward results are compared, too.
 
@@ -408,6 +451,7 @@ int main(void) {
         test_gates_and_tables(&ctx);
         test_group_norm(&ctx);
         test_convolution(&ctx);
+        test_depthwise(&ctx);
         test_resampling(&ctx);
         test_blends(&ctx);
     }
