@@ -615,14 +615,17 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
                    I2V subject      dino_vitbase16_pretrain
                    I2V background   the same, clip_vitb16_pretrain, open_clip_vitb16_pretrain, and ensemble_lora/ with
                                     adapter_model and adapter_config.json (DreamSim's dreamsim_ensemble_checkpoint)
+                   motion           amt-s
    CONVENTIONS Reported LPIPS values follow one of two: images scaled to [-1,1], as the lpips package documents it and as
                gsplat's trainer uses AlexNet; or images in [0,1] taken as if they were in [-1,1] (`raw`), as 3DGS, GSFixer
                and gsplat's trainer use VGG16. The values of the two cannot be compared.
-               I2V follows VBench with torchvision 0.17 or later: frames are resized with antialiasing. */
+               I2V follows VBench with torchvision 0.17 or later: frames are resized with antialiasing. Motion needs frames
+               of at least 113 x 113 pixels; of an even number of frames the last is not used. */
 
 typedef enum gsf_nn_metric_kind {
     GSF_NN_METRIC_LPIPS_ALEX = 0, GSF_NN_METRIC_LPIPS_VGG, GSF_NN_METRIC_LPIPS_SQUEEZE, // Zhang et al. 2018; low is good
     GSF_NN_METRIC_I2V_SUBJECT, GSF_NN_METRIC_I2V_BACKGROUND, // VBench's I2V_SC and I2V_BC: consistency with an input image
+    GSF_NN_METRIC_MOTION_SMOOTHNESS, // VBench's MS: every second frame against one interpolated from its neighbours
 } gsf_nn_metric_kind;
 
 typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when done
@@ -630,8 +633,10 @@ typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when d
     const char* models;        // folder with the weights; needed until the first frame has been measured
     int32_t raw;               // LPIPS: leave the images in [0,1]
     // results
-    double score;              // of all frames so far. LPIPS: the mean. I2V: 0 before the second frame
-    double last;               // of the last frame. LPIPS: its distance. I2V: its similarity to the input image
+    double score;              // of all frames so far. LPIPS: the mean. I2V: 0 before the second frame; motion: before the
+                               // third one
+    double last;               // of the last frame. LPIPS: its distance. I2V: its similarity to the input image. Motion: the
+                               // last mean difference to an interpolated frame, 0 to 255
     int64_t count;             // frames measured
     void* state;               // private
     const gsf__nn_tap* _tap;   // private
@@ -639,9 +644,9 @@ typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when d
 } gsf_nn_metric;
 
 // Measures the next frame, which has three channels. `reference`: for LPIPS its true image, of the same size; for I2V the
-// input image, of any size, which only the first frame needs. The first call opens the weights; frame NULL only does that.
-// A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or infinity GSF_ERROR_NUMERIC, frames that are
-// too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
+// input image, of any size, which only the first frame needs; for motion NULL. The first call opens the weights; frame NULL
+// only does that. A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or infinity GSF_ERROR_NUMERIC,
+// frames that are too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
                                                       const gsf_image* reference);
 GSF_API void gsf_nn_destroy_metric(gsf_context* ctx, gsf_nn_metric* metric);
@@ -14178,10 +14183,11 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
 
 typedef struct gsf__map { // (images, height, width, channels)
     float* data;
-    int64_t images, height, width, channels;
+    int64_t images, height, width, channels, pitch; // pitch: floats from pixel to pixel
 } gsf__map;
 
-static size_t gsf__map_count(const gsf__map* map) { // floats; SIZE_MAX, which no allocator can provide, on overflow
+// Floats of a dense map; SIZE_MAX, which no allocator can provide, on overflow.
+static size_t gsf__map_count(const gsf__map* map) {
     return gsf__nn_product(gsf__nn_product((size_t)map->images, (size_t)map->height),
                            gsf__nn_product((size_t)map->width, (size_t)map->channels));
 }
@@ -14211,81 +14217,92 @@ static void gsf__map_use(gsf__maps* maps, const gsf__map* map) {
     maps->room = !maps->room;
 }
 
-typedef struct gsf__map_conv { // a convolution; kernel and channels are those of the weight
-    const gsf__nn_layer* layer;
-    int64_t stride, pad;
-    int rectify;           // ReLU of the input
-    int64_t first, pitch;  // channel of the output's first, and channels per pixel of the output; pitch 0: 0, its own
-} gsf__map_conv;
-
-typedef struct gsf__map_fill { // the input with `pad` columns of zeros on either side
-    const float* x;
+typedef struct gsf__map_fill { // the input, dense and with `pad` columns of zeros on either side
+    const gsf__map* x;
     float* out;
-    int64_t width, channels, pad;
-    int rectify;
+    int64_t image, pad;
+    int rectify; // ReLU
 } gsf__map_fill;
 
 static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
     const gsf__map_fill* job = (const gsf__map_fill*)arg;
-    const int64_t edge = job->pad * job->channels, count = job->width * job->channels;
-    const float* x = job->x + (int64_t)row * count;
+    const gsf__map* map = job->x;
+    const int64_t c = map->channels, edge = job->pad * c, count = map->width * c;
+    const float* x = map->data + (job->image * map->height + (int64_t)row) * map->width * map->pitch;
     float* out = job->out + (int64_t)row * (count + 2 * edge);
     (void)worker;
     memset(out, 0, (size_t)edge * sizeof(float));
     memset(out + edge + count, 0, (size_t)edge * sizeof(float));
     out += edge;
-    if (!job->rectify) memcpy(out, x, (size_t)count * sizeof(float));
-    else for (int64_t i = 0; i < count; i++) out[i] = x[i] < 0.0f ? 0.0f : x[i]; // a NaN remains
+    for (int64_t i = 0; i < (map->pitch == c ? 1 : map->width); i++)
+        memcpy(out + i * c, x + i * map->pitch, (size_t)(map->pitch == c ? count : c) * sizeof(float));
+    for (int64_t i = 0; i < count && job->rectify; i++) out[i] = out[i] < 0.0f ? 0.0f : out[i]; // a NaN remains
 }
 
-// y (its data and sizes) = the convolution of x; fails if the kernel does not fit.
-static gsf_result gsf__map_convolve(gsf__maps* maps, const gsf__map_conv* c, const gsf__map* x, gsf__map* y) {
+typedef struct gsf__map_conv { // a convolution; kernel and channels are those of the weight
+    const gsf__nn_layer* layer;
+    int64_t stride, pad;
+    int rectify;              // ReLU of the input
+    int64_t above, left;      // rows before and columns within the padded input at which output 0 begins
+    int64_t ldo, out_row;     // floats from pixel to pixel, and from row to row, of the output
+} gsf__map_conv;
+
+// Writes y, of the sizes given there; y may be a part of x.
+static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__map_conv* c,
+                                       const gsf__map* x, const gsf__map* y) {
     const gsf_nn_tensor* w = c->layer->weight;
     gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2]};
     const int64_t across = x->width + 2 * c->pad, bordered = x->height * across * layer.in;
-    float* memory = (float*)gsf__nn_scratch(maps->ctx, &maps->conv,
+    float* memory = (float*)gsf__nn_scratch(ctx, workspace,
                                             ((size_t)gsf__conv_packed(&layer) + (size_t)bordered) * sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__conv_job job;
-    gsf__map_fill fill = {x->data, memory, x->width, layer.in, c->pad, c->rectify};
-    gsf__conv_pack(maps->ctx, &layer, memory + bordered);
+    gsf__map_fill fill = {x, memory, 0, c->pad, c->rectify};
+    gsf__conv_pack(ctx, &layer, memory + bordered);
     memset(&job, 0, sizeof job);
-    job.kernels = gsf__conv_kernels_of(maps->ctx->cpu_level);
+    job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
     job.in[0] = memory;
     job.in_height = x->height;
     job.in_stride = across * layer.in;
+    job.origin = c->left * layer.in;
     job.step = c->stride * layer.in;
     job.kt = 1;
     job.kh = layer.kernel;
     job.k = layer.kernel * layer.in;
     job.stride = c->stride;
-    job.pad = c->pad;
+    job.pad = c->above;
     job.packed = memory + bordered;
     job.panel = gsf__conv_panel(&layer);
     job.height = y->height;
     job.width = y->width;
     job.outputs = layer.out;
-    job.ldo = y->channels;
-    job.out_row = job.width * job.ldo;
+    job.ldo = c->ldo;
+    job.out_row = c->out_row;
     job.groups = 1;
-    for (int64_t i = 0; i < x->images; i++, fill.x += x->height * x->width * layer.in) {
-        gsf__parallel_for(maps->ctx, (size_t)x->height, gsf__map_fill_row, &fill);
-        job.out = y->data + i * y->height * y->width * y->channels + c->first;
-        gsf__conv_frame(maps->ctx, &job, NULL);
+    for (; fill.image < x->images; fill.image++) {
+        gsf__parallel_for(ctx, (size_t)x->height, gsf__map_fill_row, &fill);
+        job.out = y->data + fill.image * y->height * y->width * y->pitch;
+        gsf__conv_frame(ctx, &job, NULL);
     }
     return GSF_OK;
 }
 
+static gsf_result gsf__map_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_layer* layer,
+                                    int64_t stride, int64_t pad, int rectify, const gsf__map* x, const gsf__map* y) {
+    const gsf__map_conv c = {layer, stride, pad, rectify, pad, 0, y->pitch, y->width * y->pitch};
+    return gsf__map_convolve_at(ctx, workspace, &c, x, y);
+}
+
 // Convolves the current map into a new one, which becomes the current one.
-static gsf_result gsf__map_conv_next(gsf__maps* maps, const gsf__map_conv* c) {
-    const gsf_nn_tensor* w = c->layer->weight;
-    const int64_t high = maps->now.height + 2 * c->pad - w->shape[2], wide = maps->now.width + 2 * c->pad - w->shape[2];
-    gsf__map y = {NULL, maps->now.images, high / c->stride + 1, wide / c->stride + 1, w->shape[0]};
+static gsf_result gsf__map_conv_next(gsf__maps* maps, const gsf__nn_layer* layer, int64_t stride, int64_t pad, int rectify) {
+    const gsf_nn_tensor* w = layer->weight;
+    const int64_t high = maps->now.height + 2 * pad - w->shape[2], wide = maps->now.width + 2 * pad - w->shape[2];
+    gsf__map y = {NULL, maps->now.images, high / stride + 1, wide / stride + 1, w->shape[0], w->shape[0]};
     if (high < 0 || wide < 0)
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "%s: %lld x %lld values are too few", w->name,
                         (long long)maps->now.width, (long long)maps->now.height);
     GSF__TRY(gsf__map_make(maps, &y));
-    GSF__TRY(gsf__map_convolve(maps, c, &maps->now, &y));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, layer, stride, pad, rectify, &maps->now, &y));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -14436,7 +14453,8 @@ static int64_t gsf__pool_size(int64_t size, int64_t kernel, int up) {
 
 static gsf_result gsf__map_pool_next(gsf__maps* maps, int64_t kernel, int up) {
     const gsf__map x = maps->now;
-    gsf__map y = {NULL, x.images, gsf__pool_size(x.height, kernel, up), gsf__pool_size(x.width, kernel, up), x.channels};
+    gsf__map y = {NULL, x.images, gsf__pool_size(x.height, kernel, up), gsf__pool_size(x.width, kernel, up), x.channels,
+                  x.channels};
     gsf__map_pool_job job = {&x, &y, kernel};
     if (y.height < 1 || y.width < 1)
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "max pool: %lld x %lld values are too few", (long long)x.width,
@@ -14450,13 +14468,14 @@ static gsf_result gsf__map_pool_next(gsf__maps* maps, int64_t kernel, int up) {
 // Squeeze by 1 x 1; then 1 x 1 and 3 x 3 side by side.
 static gsf_result gsf__lpips_fire(gsf__maps* maps, const gsf__nn_layer* layers) {
     const int64_t one = layers[1].weight->shape[0], three = layers[2].weight->shape[0];
-    const gsf__map_conv squeeze = {&layers[0], 1, 0, 1, 0, 0};
-    GSF__TRY(gsf__map_conv_next(maps, &squeeze));
-    const gsf__map_conv expand[2] = {{&layers[1], 1, 0, 1, 0, 0}, {&layers[2], 1, 1, 1, one, 0}};
+    GSF__TRY(gsf__map_conv_next(maps, &layers[0], 1, 0, 1));
     gsf__map y = maps->now;
-    y.channels = one + three;
+    y.channels = y.pitch = one + three;
     GSF__TRY(gsf__map_make(maps, &y));
-    for (int i = 0; i < 2; i++) GSF__TRY(gsf__map_convolve(maps, &expand[i], &maps->now, &y));
+    gsf__map part = y;
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[1], 1, 0, 1, &maps->now, &part));
+    part.data += one;
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[2], 1, 1, 1, &maps->now, &part));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -14525,7 +14544,7 @@ static gsf_result gsf__lpips_compare(gsf_context* ctx, const gsf_nn_metric* metr
     gsf__lpips* net = (gsf__lpips*)metric->state;
     gsf__maps* maps = &net->maps;
     const gsf__lpips_step* steps = gsf__lpips_nets[metric->kind].steps;
-    gsf__map pair = {NULL, 2, a->height, a->width, 3};
+    gsf__map pair = {NULL, 2, a->height, a->width, 3, 3};
     float terms[GSF__LPIPS_TAPS];
     int taps = 0;
     *out = 0.0;
@@ -14536,9 +14555,9 @@ static gsf_result gsf__lpips_compare(gsf_context* ctx, const gsf_nn_metric* metr
     gsf__map_use(maps, &pair);
     for (int i = 0; steps[i].form; i++) {
         const gsf__lpips_step* s = &steps[i];
-        const gsf__map_conv conv = {&net->layers[i][0], s->stride, s->pad, i > 0, 0, 0};
         double term;
-        if (s->form == GSF__LPIPS_CONV) GSF__TRY(gsf__map_conv_next(maps, &conv));
+        if (s->form == GSF__LPIPS_CONV)
+            GSF__TRY(gsf__map_conv_next(maps, &net->layers[i][0], s->stride, s->pad, i > 0));
         else if (s->form == GSF__LPIPS_POOL) GSF__TRY(gsf__map_pool_next(maps, s->kernel, s->pad));
         else GSF__TRY(gsf__lpips_fire(maps, net->layers[i]));
         if (!s->tap) continue;
@@ -14929,6 +14948,815 @@ static gsf_result gsf__i2v_measure(gsf_context* ctx, gsf_nn_metric* metric, cons
     return GSF_OK;
 }
 
+// ---- metrics: AMT-S
+
+/* The frame between two others (Li et al. 2023, AMT; VBench third_party/amt/networks/AMT-S.py): flows from the middle to both
+   images, refined coarse to fine. At each of three scales, correlations of the images' features are looked up around where
+   the flows lead and update flows and features. The volume of all correlations is never made: a pooled volume equals the
+   correlation with pooled features, so each lookup computes the 8 x 8 products around its point. */
+
+enum { GSF__AMT_LEVELS = 4, GSF__AMT_RADIUS = 3, GSF__AMT_WINDOW = 2 * GSF__AMT_RADIUS + 1, GSF__AMT_FLOWS = 3,
+       GSF__AMT_SCALES = 4, GSF__AMT_ROOMS = 64,
+       GSF__AMT_LOOKUP = GSF__AMT_LEVELS * GSF__AMT_WINDOW * GSF__AMT_WINDOW, // channels for each image
+       GSF__AMT_STEP = 16, GSF__AMT_LEAST = 128 };                             // of the padded size
+
+typedef struct gsf__amt_conv { // a convolution and its PReLU, whose slope is per channel
+    gsf__nn_layer conv;
+    const gsf_nn_tensor* slope; // NULL: another activation, or none
+} gsf__amt_conv;
+
+typedef struct gsf__amt_bottleneck { gsf__amt_conv convs[3], down; } gsf__amt_bottleneck; // down: no weight, if not needed
+
+typedef struct gsf__amt_decoder {
+    gsf__amt_conv first, convs[5]; // the last one's slope is that of the sum
+    gsf__nn_layer up;              // transposed: (in, out, 4, 4)
+} gsf__amt_decoder;
+
+typedef struct gsf__amt_update { gsf__nn_layer c1, f1, f2, conv, gru[2], feature[2], flow[2]; } gsf__amt_update;
+
+typedef struct gsf__amt {
+    gsf_nn_weights weights;
+    gsf__amt_conv stem, head;             // of the features to correlate
+    gsf__amt_bottleneck bottlenecks[6];
+    gsf__amt_conv pyramid[GSF__AMT_SCALES][2];
+    gsf__amt_decoder decoders[GSF__AMT_SCALES]; // [0] works at 1/2 and gives whole pixels, [3] at 1/16
+    gsf__amt_update updates[GSF__AMT_SCALES];   // [0] is unused
+    gsf__amt_conv merge[2];
+    gsf_context* ctx;
+    const gsf__nn_tap* tap;
+    gsf__nn_workspace conv, rooms[GSF__AMT_ROOMS]; // maps in the order of their making, reused by the next pair
+    int room;
+    // the stream
+    gsf_image even, odd, middle; // the last frame of even number, the one after it (u8), and that as it should be
+    double sum;
+    int64_t frames;
+} gsf__amt;
+
+// ---- AMT-S: maps
+
+static gsf_result gsf__amt_make(gsf__amt* net, int64_t images, int64_t height, int64_t width, int64_t channels,
+                                gsf__map* out) {
+    const gsf__map map = {NULL, images, height, width, channels, channels};
+    *out = map;
+    GSF_ASSERT(net->room < GSF__AMT_ROOMS);
+    out->data = (float*)gsf__nn_scratch(net->ctx, &net->rooms[net->room++],
+                                        gsf__nn_product(gsf__map_count(out), sizeof(float)));
+    return out->data ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static gsf__map gsf__map_slice(const gsf__map* map, int64_t first, int64_t channels) {
+    gsf__map slice = *map;
+    slice.data += first;
+    slice.channels = channels;
+    return slice;
+}
+
+static gsf__map gsf__map_image(const gsf__map* map, int64_t index) {
+    gsf__map image = *map;
+    image.data += index * map->height * map->width * map->pitch;
+    image.images = 1;
+    return image;
+}
+
+typedef struct gsf__amt_row_job { // of elementwise layers
+    const gsf__map *x, *x2, *y;
+    const float* slope; // per channel, or one for all
+    float leak;
+    double scale;       // of a resize: pixels of x per pixel of y
+    float by;
+    const double* moments;
+} gsf__amt_row_job;
+
+static float* gsf__map_row(const gsf__map* map, size_t row) { return map->data + (int64_t)row * map->width * map->pitch; }
+
+static void gsf__amt_activate_row(void* arg, size_t row, int32_t worker) { // in place: x < 0 times its slope
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    float* y = gsf__map_row(job->y, row);
+    (void)worker;
+    for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
+        for (int64_t c = 0; c < job->y->channels; c++)
+            y[c] = y[c] < 0.0f ? y[c] * (job->slope ? job->slope[c] : job->leak) : y[c];
+}
+
+// PReLU with a slope per channel; NULL: `leak` for all, which is 0 for ReLU.
+static gsf_result gsf__amt_activate(gsf__amt* net, const gsf_nn_tensor* slope, float leak, const gsf__map* y) {
+    float slopes[1024];
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    if (slope && slope->count > 1024)
+        return gsf_fail(net->ctx, GSF_ERROR_UNSUPPORTED, "%s: more than 1024 channels", slope->name);
+    if (slope) gsf_nn_convert_tensor(slope, 0, slope->count, slopes);
+    job.y = y;
+    job.slope = slope ? slopes : NULL;
+    job.leak = leak;
+    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_activate_row, &job);
+    return gsf__check_cancel(net->ctx);
+}
+
+static void gsf__amt_copy_row(void* arg, size_t row, int32_t worker) {
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const float* x = gsf__map_row(job->x, row);
+    float* y = gsf__map_row(job->y, row);
+    (void)worker;
+    for (int64_t i = 0; i < job->y->width; i++, x += job->x->pitch, y += job->y->pitch)
+        memcpy(y, x, (size_t)job->y->channels * sizeof(float));
+}
+
+static void gsf__amt_copy(gsf__amt* net, const gsf__map* x, const gsf__map* y) {
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.y = y;
+    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_copy_row, &job);
+}
+
+static void gsf__amt_add_row(void* arg, size_t row, int32_t worker) {
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const float* x = gsf__map_row(job->x, row);
+    float* y = gsf__map_row(job->y, row);
+    (void)worker;
+    for (int64_t i = 0; i < job->y->width; i++, x += job->x->pitch, y += job->y->pitch)
+        for (int64_t c = 0; c < job->y->channels; c++) y[c] += x[c];
+}
+
+static void gsf__amt_add(gsf__amt* net, const gsf__map* x, const gsf__map* y) { // y += x
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.y = y;
+    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_add_row, &job);
+}
+
+// The pixels left of and right of a coordinate, and the share of the right one.
+typedef struct gsf__between { int64_t low, high; float share; } gsf__between;
+
+static gsf__between gsf__look_between(double x, int64_t size) { // clamped to the border
+    gsf__between b;
+    x = x > 0.0 ? x : 0.0; // also of a NaN
+    x = x < (double)(size - 1) ? x : (double)(size - 1);
+    b.low = (int64_t)x;
+    b.high = gsf__least(b.low + 1, size - 1);
+    b.share = (float)(x - (double)b.low);
+    return b;
+}
+
+// y = by * bilinear interpolation of x (height and width of row 0) at a point; `channels` values
+static void gsf__map_sample(const gsf__map* x, gsf__between v, gsf__between u, float by, int64_t channels, float* y) {
+    const float *a = x->data + (v.low * x->width + u.low) * x->pitch,
+                *b = x->data + (v.low * x->width + u.high) * x->pitch;
+    const float *c = x->data + (v.high * x->width + u.low) * x->pitch,
+                *d = x->data + (v.high * x->width + u.high) * x->pitch;
+    for (int64_t i = 0; i < channels; i++) {
+        const float top = a[i] + (b[i] - a[i]) * u.share, bottom = c[i] + (d[i] - c[i]) * u.share;
+        y[i] = by * (top + (bottom - top) * v.share);
+    }
+}
+
+static void gsf__amt_resize_row(void* arg, size_t row, int32_t worker) {
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    float* y = gsf__map_row(job->y, row);
+    const gsf__between v = gsf__look_between(((double)row + 0.5) * job->scale - 0.5, job->x->height);
+    (void)worker;
+    for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch)
+        gsf__map_sample(job->x, v, gsf__look_between(((double)i + 0.5) * job->scale - 0.5, job->x->width), job->by,
+                        job->y->channels, y);
+}
+
+// y = by * x resized bilinearly, without antialiasing, as PyTorch does it (align_corners=False); one image
+static void gsf__amt_resize(gsf__amt* net, const gsf__map* x, double scale, double by, const gsf__map* y) {
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.y = y;
+    job.scale = 1.0 / scale;
+    job.by = (float)by;
+    gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_resize_row, &job);
+}
+
+static void gsf__amt_warp_row(void* arg, size_t row, int32_t worker) { // x2: the flow
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const float* flow = gsf__map_row(job->x2, row);
+    float* y = gsf__map_row(job->y, row);
+    (void)worker;
+    for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch, flow += job->x2->pitch)
+        gsf__map_sample(job->x, gsf__look_between((double)row + (double)flow[1], job->x->height),
+                        gsf__look_between((double)i + (double)flow[0], job->x->width), 1.0f, job->y->channels, y);
+}
+
+static void gsf__amt_warp(gsf__amt* net, const gsf__map* x, const gsf__map* flow, const gsf__map* y) {
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.x2 = flow;
+    job.y = y;
+    gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_warp_row, &job);
+}
+
+static void gsf__amt_sum_channel(void* arg, size_t chunk, int32_t worker) { // mean and deviation of a channel of an image
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const gsf__map* y = job->y;
+    const int64_t image = (int64_t)chunk / y->channels, pixels = y->height * y->width;
+    const float* from = y->data + image * pixels * y->pitch + (int64_t)chunk % y->channels;
+    double sum = 0.0, square = 0.0, *out = (double*)(uintptr_t)job->moments + 2 * chunk;
+    (void)worker;
+    for (int64_t i = 0; i < pixels; i++) sum += (double)from[i * y->pitch];
+    const double mean = sum / (double)pixels;
+    for (int64_t i = 0; i < pixels; i++) square += ((double)from[i * y->pitch] - mean) * ((double)from[i * y->pitch] - mean);
+    out[0] = mean;
+    out[1] = 1.0 / sqrt(square / (double)pixels + 1e-5);
+}
+
+static void gsf__amt_norm_row(void* arg, size_t row, int32_t worker) {
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const double* moments = job->moments + (int64_t)row / job->y->height * 2 * job->y->channels;
+    float* y = gsf__map_row(job->y, row);
+    (void)worker;
+    for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
+        for (int64_t c = 0; c < job->y->channels; c++) {
+            const float v = (float)(((double)y[c] - moments[2 * c]) * moments[2 * c + 1]);
+            y[c] = v < 0.0f ? v * job->leak : v;
+        }
+}
+
+// Instance norm in place: each channel of each image gets mean 0 and deviation 1; then ReLU, if `rectify` is set.
+static gsf_result gsf__amt_norm(gsf__amt* net, int rectify, const gsf__map* y) {
+    const size_t count = (size_t)(y->images * y->channels);
+    double* moments = (double*)gsf_alloc(net->ctx, count, 2 * sizeof(double));
+    gsf__amt_row_job job;
+    if (!moments) return GSF_ERROR_OUT_OF_MEMORY;
+    memset(&job, 0, sizeof job);
+    job.y = y;
+    job.moments = moments;
+    job.leak = rectify ? 0.0f : 1.0f;
+    gsf__parallel_for(net->ctx, count, gsf__amt_sum_channel, &job);
+    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_norm_row, &job);
+    gsf_free(net->ctx, moments);
+    return gsf__check_cancel(net->ctx);
+}
+
+// ---- AMT-S: layers
+
+// A new map y = conv(x), with its PReLU if it has one.
+static gsf_result gsf__amt_convolve(gsf__amt* net, const gsf__amt_conv* layer, int64_t stride, const gsf__map* x,
+                                    gsf__map* y) {
+    const int64_t pad = layer->conv.weight->shape[2] / 2, over = 2 * pad - layer->conv.weight->shape[2];
+    GSF__TRY(gsf__amt_make(net, x->images, (x->height + over) / stride + 1, (x->width + over) / stride + 1,
+                           layer->conv.weight->shape[0], y));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &layer->conv, stride, pad, 0, x, y));
+    return layer->slope ? gsf__amt_activate(net, layer->slope, 0.0f, y) : GSF_OK;
+}
+
+// The same in place or into an existing map, at stride 1; `leak` is the slope of a LeakyReLU, 1: none
+static gsf_result gsf__amt_convolve_to(gsf__amt* net, const gsf__nn_layer* layer, float leak, const gsf__map* x,
+                                       const gsf__map* y) {
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, layer, 1, layer->weight->shape[2] / 2, 0, x, y));
+    return leak != 1.0f ? gsf__amt_activate(net, NULL, leak, y) : GSF_OK;
+}
+
+// ConvTranspose2d(4, stride 2, padding 1): for each parity of the output's row and column a 2 x 2 convolution.
+static gsf_result gsf__amt_up(gsf__amt* net, const gsf__nn_layer* layer, const gsf__map* x, const gsf__map* y) {
+    const int64_t in = layer->weight->shape[0], out = layer->weight->shape[1], shape[4] = {out, in, 2, 2};
+    float* parts = (float*)gsf_alloc(net->ctx, (size_t)(16 * in * out), 2 * sizeof(float));
+    gsf_result result = parts ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (!result) gsf_nn_convert_tensor(layer->weight, 0, 16 * in * out, parts + 16 * in * out);
+    for (int64_t parity = 0; parity < 4 && !result; parity++) {
+        const int64_t py = parity / 2, px = parity % 2;
+        float* w = parts + parity * 4 * in * out;
+        for (int64_t o = 0; o < out; o++)
+            for (int64_t i = 0; i < in; i++)
+                for (int64_t k = 0; k < 4; k++) // rows before and at the output's (parity 0), or at and after it
+                    w[(o * in + i) * 4 + k] = parts[16 * in * out + (i * out + o) * 16 + (3 - py - 2 * (k / 2)) * 4 +
+                                                    (3 - px - 2 * (k % 2))];
+        const gsf_nn_tensor weight = gsf_nn_wrap_tensor(layer->weight->name, w, 4, shape);
+        const gsf__nn_layer quarter = {&weight, layer->bias};
+        gsf__map part = *y;
+        part.data += (py * y->width + px) * y->pitch;
+        part.height = x->height;
+        part.width = x->width;
+        const gsf__map_conv c = {&quarter, 1, 1, 0, 1 - py, px, 2 * y->pitch, 2 * y->width * y->pitch};
+        result = gsf__map_convolve_at(net->ctx, &net->conv, &c, x, &part);
+    }
+    gsf_free(net->ctx, parts);
+    return result ? result : gsf__check_cancel(net->ctx);
+}
+
+static gsf_result gsf__amt_bottleneck_run(gsf__amt* net, const gsf__amt_bottleneck* b, int64_t stride, const gsf__map* x,
+                                          gsf__map* out) {
+    gsf__map a, c, d;
+    GSF__TRY(gsf__amt_convolve(net, &b->convs[0], 1, x, &a));
+    GSF__TRY(gsf__amt_norm(net, 1, &a));
+    GSF__TRY(gsf__amt_convolve(net, &b->convs[1], stride, &a, &c));
+    GSF__TRY(gsf__amt_norm(net, 1, &c));
+    GSF__TRY(gsf__amt_convolve(net, &b->convs[2], 1, &c, out));
+    GSF__TRY(gsf__amt_norm(net, 1, out));
+    if (b->down.conv.weight) {
+        GSF__TRY(gsf__amt_convolve(net, &b->down, stride, x, &d));
+        GSF__TRY(gsf__amt_norm(net, 0, &d));
+    }
+    gsf__amt_add(net, b->down.conv.weight ? &d : x, out);
+    return gsf__amt_activate(net, NULL, 0.0f, out);
+}
+
+// Concatenated input -> flows (4 channels) and what follows them, at twice the size; y has been made.
+static gsf_result gsf__amt_decode(gsf__amt* net, const gsf__amt_decoder* d, const gsf__map* x, const gsf__map* y) {
+    gsf__map a, b, c;
+    GSF__TRY(gsf__amt_convolve(net, &d->first, 1, x, &a));
+    GSF__TRY(gsf__amt_convolve(net, &d->convs[0], 1, &a, &b));
+    for (int i = 1; i <= 3; i++) { // 1, 3: the last channels only, in place; 2: all
+        const int64_t side = d->convs[i].conv.weight->shape[0];
+        const gsf__map part = gsf__map_slice(&b, b.channels - side, side);
+        if (i == 2) {
+            GSF__TRY(gsf__amt_convolve(net, &d->convs[2], 1, &b, &c));
+            b = c;
+            continue;
+        }
+        GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[i].conv, 1, 1, 0, &part, &part));
+        GSF__TRY(gsf__amt_activate(net, d->convs[i].slope, 0.0f, &part));
+    }
+    GSF__TRY(gsf__amt_make(net, 1, b.height, b.width, b.channels, &c));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[4].conv, 1, 1, 0, &b, &c));
+    gsf__amt_add(net, &a, &c);
+    GSF__TRY(gsf__amt_activate(net, d->convs[4].slope, 0.0f, &c));
+    return gsf__amt_up(net, &d->up, &c, y);
+}
+
+// ---- AMT-S: correlation
+
+typedef struct gsf__amt_lookup_job {
+    const gsf__map* from;                    // features of one image, 1/8
+    const gsf__map* pyramid;                 // (levels) of the other's
+    const gsf__map *flow, *out;              // (flow: 2 channels, in 1/8 pixels; out: levels * 49)
+} gsf__amt_lookup_job;
+
+static float gsf__amt_dot(const float* a, const float* b, int64_t count) {
+    float sums[8] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8)
+        for (int k = 0; k < 8; k++) sums[k] += a[i + k] * b[i + k];
+    for (; i < count; i++) sums[i & 7] += a[i] * b[i];
+    return ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
+}
+
+static void gsf__amt_lookup_row(void* arg, size_t row, int32_t worker) {
+    enum { SIDE = GSF__AMT_WINDOW + 1 };
+    const gsf__amt_lookup_job* job = (const gsf__amt_lookup_job*)arg;
+    const int64_t channels = job->from->channels;
+    const float *from = gsf__map_row(job->from, row), *flow = gsf__map_row(job->flow, row);
+    const float scale = (float)(1.0 / sqrt((double)channels));
+    float* out = gsf__map_row(job->out, row);
+    (void)worker;
+    for (int64_t x = 0; x < job->from->width; x++, from += job->from->pitch, flow += job->flow->pitch, out += job->out->pitch)
+        for (int level = 0; level < GSF__AMT_LEVELS; level++) {
+            const gsf__map* to = &job->pyramid[level];
+            const double by = 1.0 / (double)(1 << level);
+            double u = ((double)x + 2.0 * (double)flow[0]) * by, v = ((double)row + 2.0 * (double)flow[1]) * by;
+            float products[SIDE][SIDE];
+            if (!(fabs(u) < 1e6)) u = 1e6; // outside, as is a NaN
+            if (!(fabs(v) < 1e6)) v = 1e6;
+            const int64_t u0 = (int64_t)floor(u) - GSF__AMT_RADIUS, v0 = (int64_t)floor(v) - GSF__AMT_RADIUS;
+            const float du = (float)(u - floor(u)), dv = (float)(v - floor(v));
+            for (int64_t j = 0; j < SIDE; j++)
+                for (int64_t i = 0; i < SIDE; i++) {
+                    const int inside = u0 + i >= 0 && u0 + i < to->width && v0 + j >= 0 && v0 + j < to->height;
+                    const float* at = inside ? to->data + ((v0 + j) * to->width + u0 + i) * to->pitch : NULL;
+                    products[j][i] = at ? scale * gsf__amt_dot(from, at, channels) : 0.0f;
+                }
+            float* window = out + level * GSF__AMT_WINDOW * GSF__AMT_WINDOW;
+            for (int64_t i = 0; i < GSF__AMT_WINDOW; i++) // the offset in x varies slowest
+                for (int64_t j = 0; j < GSF__AMT_WINDOW; j++) {
+                    const float top = products[j][i] + (products[j][i + 1] - products[j][i]) * du;
+                    const float bottom = products[j + 1][i] + (products[j + 1][i + 1] - products[j + 1][i]) * du;
+                    window[i * GSF__AMT_WINDOW + j] = top + (bottom - top) * dv;
+                }
+        }
+}
+
+static void gsf__amt_pool_row(void* arg, size_t row, int32_t worker) { // means of 2 x 2
+    const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const float *a = gsf__map_row(job->x, 2 * row), *b = gsf__map_row(job->x, 2 * row + 1);
+    float* y = gsf__map_row(job->y, row);
+    const int64_t c = job->y->channels;
+    (void)worker;
+    for (int64_t x = 0; x < job->y->width; x++, a += 2 * c, b += 2 * c, y += c)
+        for (int64_t i = 0; i < c; i++) y[i] = 0.25f * ((a[i] + a[c + i]) + (b[i] + b[c + i]));
+}
+
+static gsf_result gsf__amt_make_pyramid(gsf__amt* net, const gsf__map* features, gsf__map* pyramid) {
+    pyramid[0] = *features;
+    for (int i = 1; i < GSF__AMT_LEVELS; i++) {
+        gsf__amt_row_job job;
+        memset(&job, 0, sizeof job);
+        job.x = &pyramid[i - 1];
+        job.y = &pyramid[i];
+        GSF__TRY(gsf__amt_make(net, 1, job.x->height / 2, job.x->width / 2, job.x->channels, &pyramid[i]));
+        gsf__parallel_for(net->ctx, (size_t)pyramid[i].height, gsf__amt_pool_row, &job);
+    }
+    return GSF_OK;
+}
+
+// ---- AMT-S: the network
+
+typedef struct gsf__amt_pair { // of an interpolation
+    gsf__map images;                            // both, padded, less their mean
+    double mean;
+    gsf__map pyramids[2][GSF__AMT_LEVELS];      // features to correlate, of either image
+    gsf__map features[GSF__AMT_SCALES];         // of both images, from 1/2 to 1/16
+} gsf__amt_pair;
+
+static void gsf__amt_reveal(const gsf__amt* net, const char* name, int level, const gsf__map* map) {
+    if (!net->tap) return;
+    for (int64_t i = 0; i < map->images; i++) { // pixel by pixel, as slices are not dense; `rows` is the pixel's number
+        const gsf__map image = gsf__map_image(map, i);
+        for (int64_t k = 0; k < map->height * map->width; k++)
+            net->tap->fn(net->tap->user, name, (int32_t)(level * 2 + i), image.data + k * map->pitch, k, map->channels);
+    }
+}
+
+static gsf_result gsf__amt_encode(gsf__amt* net, gsf__amt_pair* pair) {
+    gsf__map x, y;
+    GSF__TRY(gsf__amt_convolve(net, &net->stem, 2, &pair->images, &x));
+    GSF__TRY(gsf__amt_norm(net, 1, &x));
+    for (int i = 0; i < 6; i++, x = y)
+        GSF__TRY(gsf__amt_bottleneck_run(net, &net->bottlenecks[i], i == 2 || i == 4 ? 2 : 1, &x, &y));
+    GSF__TRY(gsf__amt_convolve(net, &net->head, 1, &x, &y));
+    gsf__amt_reveal(net, "feat_encoder", 0, &y);
+    for (int i = 0; i < 2; i++) {
+        const gsf__map image = gsf__map_image(&y, i);
+        GSF__TRY(gsf__amt_make_pyramid(net, &image, pair->pyramids[i]));
+    }
+    x = pair->images;
+    for (int i = 0; i < GSF__AMT_SCALES; i++, x = pair->features[i - 1]) {
+        GSF__TRY(gsf__amt_convolve(net, &net->pyramid[i][0], 2, &x, &y));
+        GSF__TRY(gsf__amt_convolve(net, &net->pyramid[i][1], 1, &y, &pair->features[i]));
+        gsf__amt_reveal(net, "pyramid", i, &pair->features[i]);
+    }
+    return GSF_OK;
+}
+
+// Adds the update to decoded flows (4 channels) and features, at 1/`down` of the correlations' scale.
+static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_pair* pair, const gsf__map* decoded) {
+    const gsf__amt_update* u = &net->updates[scale];
+    const gsf__map flows = gsf__map_slice(decoded, 0, 4), features = gsf__map_slice(decoded, 4, decoded->channels - 4);
+    const int64_t high = pair->pyramids[0][0].height, wide = pair->pyramids[0][0].width;
+    const double down = (double)(1 << (3 - scale));
+    const int64_t of_c = u->c1.weight->shape[0], of_f = u->f2.weight->shape[0], of_m = u->conv.weight->shape[0];
+    gsf__map corr, mix, flow1, input, hidden[2], small, delta;
+    const int room = net->room;
+    GSF__TRY(gsf__amt_make(net, 1, high, wide, 2 * GSF__AMT_LOOKUP, &corr));
+    GSF__TRY(gsf__amt_make(net, 1, high, wide, of_c + of_f, &mix));
+    GSF__TRY(gsf__amt_make(net, 1, high, wide, of_m + 4 + features.channels, &input)); // motion, flows, features
+    const gsf__map flow = gsf__map_slice(&input, of_m, 4), kept = gsf__map_slice(&input, of_m + 4, features.channels);
+    gsf__amt_resize(net, &flows, 1.0 / down, 1.0 / down, &flow);
+    gsf__amt_resize(net, &features, 1.0 / down, 1.0, &kept);
+    for (int i = 0; i < 2; i++) { // the middle's flow to the second image, doubled, leads from the first to it
+        const gsf__map way = gsf__map_slice(&flow, 2 * !i, 2);
+        const gsf__map out = gsf__map_slice(&corr, i * GSF__AMT_LOOKUP, GSF__AMT_LOOKUP);
+        gsf__amt_lookup_job job = {&pair->pyramids[i][0], pair->pyramids[!i], &way, &out};
+        gsf__parallel_for(net->ctx, (size_t)high, gsf__amt_lookup_row, &job);
+    }
+    gsf__amt_reveal(net, "update.in_flow", scale, &flow);
+    gsf__amt_reveal(net, "update.corr", scale, &corr);
+    const gsf__map mixed_c = gsf__map_slice(&mix, 0, of_c), mixed_f = gsf__map_slice(&mix, of_c, of_f);
+    const gsf__map motion = gsf__map_slice(&input, 0, of_m);
+    GSF__TRY(gsf__amt_convolve_to(net, &u->c1, 0.1f, &corr, &mixed_c));
+    GSF__TRY(gsf__amt_make(net, 1, high, wide, u->f1.weight->shape[0], &flow1));
+    GSF__TRY(gsf__amt_convolve_to(net, &u->f1, 0.1f, &flow, &flow1));
+    GSF__TRY(gsf__amt_convolve_to(net, &u->f2, 0.1f, &flow1, &mixed_f));
+    GSF__TRY(gsf__amt_convolve_to(net, &u->conv, 0.1f, &mix, &motion));
+    for (int i = 0; i < 2; i++) {
+        GSF__TRY(gsf__amt_make(net, 1, high, wide, u->gru[i].weight->shape[0], &hidden[i]));
+        GSF__TRY(gsf__amt_convolve_to(net, &u->gru[i], i ? 1.0f : 0.1f, i ? &hidden[0] : &input, &hidden[i]));
+    }
+    for (int i = 0; i < 2; i++) { // flows, features
+        const gsf__nn_layer* head = i ? u->feature : u->flow;
+        const gsf__map* to = i ? &features : &flows;
+        const char* const names[2] = {"update.out1", "update.out0"};
+        GSF__TRY(gsf__amt_make(net, 1, high, wide, head[0].weight->shape[0], &hidden[0]));
+        GSF__TRY(gsf__amt_convolve_to(net, &head[0], 0.1f, &hidden[1], &hidden[0]));
+        GSF__TRY(gsf__amt_make(net, 1, high, wide, to->channels, &small));
+        GSF__TRY(gsf__amt_convolve_to(net, &head[1], 1.0f, &hidden[0], &small));
+        GSF__TRY(gsf__amt_make(net, 1, to->height, to->width, to->channels, &delta));
+        gsf__amt_resize(net, &small, down, i ? 1.0 : down, &delta);
+        gsf__amt_reveal(net, names[i], scale, &delta);
+        gsf__amt_add(net, &delta, to);
+    }
+    net->room = room;
+    return GSF_OK;
+}
+
+// decoded (flows, features) at a scale -> at the next finer one; scale 3: there is none before
+static gsf_result gsf__amt_refine(gsf__amt* net, int scale, const gsf__amt_pair* pair, const gsf__map* before,
+                                  gsf__map* decoded) {
+    const gsf__map* f = &pair->features[scale];
+    const int64_t c = f->channels, high = f->height, wide = f->width, kept = before ? before->channels - 4 : 0;
+    gsf__map input, coarse;
+    GSF__TRY(gsf__amt_make(net, 1, 2 * high, 2 * wide, net->decoders[scale].up.weight->shape[1], decoded));
+    const int room = net->room;
+    GSF__TRY(gsf__amt_make(net, 1, high, wide, before ? kept + 2 * c + 4 : 2 * c + 1, &input));
+    for (int i = 0; i < 2; i++) {
+        const gsf__map image = gsf__map_image(f, i), to = gsf__map_slice(&input, kept + i * c, c);
+        if (!before) {
+            gsf__amt_copy(net, &image, &to);
+        } else {
+            const gsf__map flow = gsf__map_slice(before, 2 * i, 2);
+            gsf__amt_warp(net, &image, &flow, &to);
+        }
+    }
+    if (before) {
+        const gsf__map features = gsf__map_slice(before, 4, kept), flows = gsf__map_slice(before, 0, 4);
+        const gsf__map to = gsf__map_slice(&input, 0, kept), to_flows = gsf__map_slice(&input, kept + 2 * c, 4);
+        gsf__amt_copy(net, &features, &to);
+        gsf__amt_copy(net, &flows, &to_flows);
+    } else {
+        for (int64_t i = 0; i < high * wide; i++) input.data[i * input.pitch + 2 * c] = 0.5f; // the time in the middle
+    }
+    GSF__TRY(gsf__amt_decode(net, &net->decoders[scale], &input, decoded));
+    if (before) {
+        const gsf__map flows = gsf__map_slice(before, 0, 4);
+        GSF__TRY(gsf__amt_make(net, 1, 2 * high, 2 * wide, 4, &coarse));
+        gsf__amt_resize(net, &flows, 2.0, 2.0, &coarse);
+        for (int i = 0; i < 2 && scale == 0; i++) // each of the candidates' flows, all to the first image, then the second
+            for (int k = 0; k < GSF__AMT_FLOWS; k++) {
+                const gsf__map from = gsf__map_slice(&coarse, 2 * i, 2);
+                const gsf__map to = gsf__map_slice(decoded, 2 * (i * GSF__AMT_FLOWS + k), 2);
+                gsf__amt_add(net, &from, &to);
+            }
+        const gsf__map to = gsf__map_slice(decoded, 0, 4);
+        if (scale > 0) gsf__amt_add(net, &coarse, &to);
+    }
+    gsf__amt_reveal(net, "decoder", scale, decoded);
+    net->room = room;
+    return GSF_OK;
+}
+
+typedef struct gsf__amt_merge_job {
+    const gsf__map *images, *decoded, *candidates;
+    double mean;
+} gsf__amt_merge_job;
+
+// Candidates: both images along the flows, mixed by a mask, plus a residual.
+static void gsf__amt_merge_row(void* arg, size_t row, int32_t worker) {
+    const gsf__amt_merge_job* job = (const gsf__amt_merge_job*)arg;
+    const gsf__map image[2] = {gsf__map_image(job->images, 0), gsf__map_image(job->images, 1)};
+    const float* d = gsf__map_row(job->decoded, row);
+    float* y = gsf__map_row(job->candidates, row);
+    (void)worker;
+    for (int64_t x = 0; x < job->images->width; x++, d += job->decoded->pitch, y += job->candidates->pitch)
+        for (int k = 0; k < GSF__AMT_FLOWS; k++) {
+            float warped[2][3];
+            const double mask = 1.0 / (1.0 + exp(-(double)d[4 * GSF__AMT_FLOWS + k]));
+            for (int i = 0; i < 2; i++) {
+                const float* flow = d + 2 * (i * GSF__AMT_FLOWS + k);
+                gsf__map_sample(&image[i], gsf__look_between((double)row + (double)flow[1], image[i].height),
+                                gsf__look_between((double)x + (double)flow[0], image[i].width), 1.0f, 3, warped[i]);
+            }
+            for (int c = 0; c < 3; c++)
+                y[3 * k + c] = (float)(mask * (double)warped[0][c] + (1.0 - mask) * (double)warped[1][c] + job->mean +
+                                       (double)d[5 * GSF__AMT_FLOWS + 3 * k + c]);
+        }
+}
+
+// The frame between the pair's, unclamped: (padded height, padded width, 3)
+static gsf_result gsf__amt_interpolate(gsf__amt* net, gsf__amt_pair* pair, gsf__map* out) {
+    gsf__map decoded, finer, candidates, hidden;
+    GSF__TRY(gsf__amt_encode(net, pair));
+    for (int scale = GSF__AMT_SCALES - 1; scale >= 0; scale--, decoded = finer) {
+        GSF__TRY(gsf__amt_refine(net, scale, pair, scale == GSF__AMT_SCALES - 1 ? NULL : &decoded, &finer));
+        if (scale > 0) GSF__TRY(gsf__amt_update_run(net, scale, pair, &finer));
+    }
+    GSF__TRY(gsf__amt_make(net, 1, pair->images.height, pair->images.width, 3 * GSF__AMT_FLOWS, &candidates));
+    gsf__amt_merge_job job = {&pair->images, &decoded, &candidates, pair->mean};
+    gsf__parallel_for(net->ctx, (size_t)candidates.height, gsf__amt_merge_row, &job);
+    GSF__TRY(gsf__amt_convolve(net, &net->merge[0], 1, &candidates, &hidden));
+    GSF__TRY(gsf__amt_convolve(net, &net->merge[1], 1, &hidden, out));
+    for (int64_t i = 0; i < out->height * out->width; i++)
+        for (int c = 0; c < 3; c++) {
+            const float* y = candidates.data + i * candidates.pitch + c;
+            out->data[3 * i + c] += (float)(((double)y[0] + (double)y[3] + (double)y[6]) / (double)GSF__AMT_FLOWS);
+        }
+    return GSF_OK;
+}
+
+// Pads both images (u8) to multiples of 16 by repeating their borders, and removes their common mean.
+static gsf_result gsf__amt_pad(gsf__amt* net, const gsf_image* a, const gsf_image* b, gsf__amt_pair* pair) {
+    const int64_t wide = gsf__round_up(a->width, GSF__AMT_STEP), high = gsf__round_up(a->height, GSF__AMT_STEP);
+    const int64_t left = (wide - a->width) / 2, top = (high - a->height) / 2;
+    uint64_t sum = 0;
+    if (wide < GSF__AMT_LEAST || high < GSF__AMT_LEAST)
+        return gsf_fail(net->ctx, GSF_ERROR_DEGENERATE, "motion smoothness: frames of %lld x %lld are below %d pixels",
+                        (long long)a->width, (long long)a->height, (int)GSF__AMT_LEAST);
+    GSF__TRY(gsf__amt_make(net, 2, high, wide, 3, &pair->images));
+    for (int pass = 0; pass < 2; pass++) {
+        float* out = pair->images.data;
+        for (int k = 0; k < 2; k++)
+            for (int64_t y = 0; y < high; y++)
+                for (int64_t x = 0; x < wide; x++) {
+                    const gsf_image* image = k ? b : a;
+                    const int64_t v = y < top ? 0 : gsf__least(y - top, a->height - 1);
+                    const int64_t u = x < left ? 0 : gsf__least(x - left, a->width - 1);
+                    const uint8_t* at = (const uint8_t*)image->data + v * image->stride_y + u * image->stride_x;
+                    for (int c = 0; c < 3; c++) {
+                        if (pass) *out++ = (float)(at[c] / 255.0 - pair->mean);
+                        else sum += at[c];
+                    }
+                }
+        pair->mean = (double)sum / 255.0 / (6.0 * (double)wide * (double)high);
+    }
+    return GSF_OK;
+}
+
+// ---- AMT-S: opening it
+
+static gsf_result gsf__amt_need(gsf__nn_loader* loader, gsf__nn_layer* out, int64_t in, int64_t kernel, const char* name) {
+    const int64_t shape[4] = {-1, in, kernel, kernel};
+    GSF__TRY(gsf__nn_need(loader, &out->weight, 4, shape, "%s.weight", name));
+    if (out->weight->shape[0] < 1)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s is empty", loader->weights->name, out->weight->name);
+    return gsf__nn_need(loader, &out->bias, 1, out->weight->shape, "%s.bias", name);
+}
+
+// NAME.0 and its PReLU NAME.1
+static gsf_result gsf__amt_need_prelu(gsf__nn_loader* loader, gsf__amt_conv* out, int64_t in, const char* name) {
+    char conv[96];
+    snprintf(conv, sizeof conv, "%s.0", name);
+    GSF__TRY(gsf__amt_need(loader, &out->conv, in, 3, conv));
+    return gsf__nn_need(loader, &out->slope, 1, out->conv.weight->shape, "%s.1.weight", name);
+}
+
+static gsf_result gsf__amt_wrong(const gsf__nn_loader* loader, const gsf_nn_tensor* tensor) {
+    return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s does not fit the layers around it", loader->weights->name,
+                    tensor->name);
+}
+
+static gsf_result gsf__amt_bind_decoder(gsf__nn_loader* loader, int scale, int64_t in, int64_t out, gsf__amt_decoder* d) {
+    char name[96];
+    snprintf(name, sizeof name, "decoder%d.convblock.0", scale + 1);
+    GSF__TRY(gsf__amt_need_prelu(loader, &d->first, in, name));
+    const int64_t width = d->first.conv.weight->shape[0], up[4] = {width, out, 4, 4};
+    int64_t side = 0;
+    for (int i = 0; i < 4; i++) {
+        snprintf(name, sizeof name, "decoder%d.convblock.1.conv%d", scale + 1, i + 1);
+        GSF__TRY(gsf__amt_need_prelu(loader, &d->convs[i], i % 2 == 0 ? width : i == 1 ? -1 : side, name));
+        const int64_t channels = d->convs[i].conv.weight->shape[0];
+        if (i == 1) side = channels;
+        if (channels != (i % 2 == 0 ? width : side) || d->convs[i].conv.weight->shape[1] != channels || side > width)
+            return gsf__amt_wrong(loader, d->convs[i].conv.weight);
+    }
+    snprintf(name, sizeof name, "decoder%d.convblock.1.conv5", scale + 1);
+    GSF__TRY(gsf__amt_need(loader, &d->convs[4].conv, width, 3, name));
+    if (d->convs[4].conv.weight->shape[0] != width) return gsf__amt_wrong(loader, d->convs[4].conv.weight);
+    GSF__TRY(gsf__nn_need(loader, &d->convs[4].slope, 1, d->convs[4].conv.weight->shape, "decoder%d.convblock.1.prelu.weight",
+                          scale + 1));
+    GSF__TRY(gsf__nn_need(loader, &d->up.weight, 4, up, "decoder%d.convblock.2.weight", scale + 1));
+    return gsf__nn_need(loader, &d->up.bias, 1, up + 1, "decoder%d.convblock.2.bias", scale + 1);
+}
+
+static gsf_result gsf__amt_bind_update(gsf__nn_loader* loader, int scale, int64_t features, gsf__amt_update* u) {
+    struct { gsf__nn_layer* layer; int64_t in, kernel, out; const char* name; } parts[10] = {
+        {&u->c1, 2 * GSF__AMT_LOOKUP, 1, -1, "convc1"}, {&u->f1, 4, 7, -1, "convf1"}, {&u->f2, -1, 3, -1, "convf2"},
+        {&u->conv, -1, 3, -1, "conv"}, {&u->gru[0], -1, 3, -1, "gru.0"}, {&u->gru[1], -1, 3, -1, "gru.2"},
+        {&u->feature[0], -1, 3, -1, "feat_head.0"}, {&u->feature[1], -1, 3, features, "feat_head.2"},
+        {&u->flow[0], -1, 3, -1, "flow_head.0"}, {&u->flow[1], -1, 3, 4, "flow_head.2"},
+    };
+    for (int i = 0; i < 10; i++) {
+        char name[64];
+        int64_t in = parts[i].in;
+        if (i == 3) in = u->c1.weight->shape[0] + u->f2.weight->shape[0];
+        else if (i == 4) in = u->conv.weight->shape[0] + 4 + features;
+        else if (i == 6 || i == 8) in = u->gru[1].weight->shape[0];
+        else if (i > 1) in = parts[i - 1].layer->weight->shape[0];
+        snprintf(name, sizeof name, "update%d.%s", scale + 1, parts[i].name);
+        GSF__TRY(gsf__amt_need(loader, parts[i].layer, in, parts[i].kernel, name));
+        if (parts[i].out >= 0 && parts[i].layer->weight->shape[0] != parts[i].out)
+            return gsf__amt_wrong(loader, parts[i].layer->weight);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__amt_bind_features(gsf__nn_loader* loader, gsf__amt* net) {
+    char name[96];
+    GSF__TRY(gsf__amt_need(loader, &net->stem.conv, 3, 7, "feat_encoder.conv1"));
+    int64_t channels = net->stem.conv.weight->shape[0];
+    for (int i = 0; i < 6; i++) {
+        gsf__amt_bottleneck* b = &net->bottlenecks[i];
+        int64_t in = channels;
+        for (int k = 0; k < 3; k++) {
+            snprintf(name, sizeof name, "feat_encoder.layer%d.%d.conv%d", i / 2 + 1, i % 2, k + 1);
+            GSF__TRY(gsf__amt_need(loader, &b->convs[k].conv, in, k == 1 ? 3 : 1, name));
+            in = b->convs[k].conv.weight->shape[0];
+        }
+        snprintf(name, sizeof name, "feat_encoder.layer%d.0.downsample.0", i / 2 + 1);
+        if (i == 2 || i == 4) GSF__TRY(gsf__amt_need(loader, &b->down.conv, channels, 1, name));
+        if ((b->down.conv.weight ? b->down.conv.weight->shape[0] : channels) != in)
+            return gsf__amt_wrong(loader, b->convs[2].conv.weight);
+        channels = in;
+    }
+    return gsf__amt_need(loader, &net->head.conv, channels, 1, "feat_encoder.conv2");
+}
+
+static gsf_result gsf__amt_bind(gsf__nn_loader* loader, gsf__amt* net) {
+    int64_t channels[GSF__AMT_SCALES], in = 3;
+    char name[96];
+    GSF__TRY(gsf__amt_bind_features(loader, net));
+    for (int i = 0; i < GSF__AMT_SCALES; i++)
+        for (int k = 0; k < 2; k++) {
+            snprintf(name, sizeof name, "encoder.pyramid%d.%d", i + 1, k);
+            GSF__TRY(gsf__amt_need_prelu(loader, &net->pyramid[i][k], in, name));
+            in = channels[i] = net->pyramid[i][k].conv.weight->shape[0];
+        }
+    for (int i = GSF__AMT_SCALES - 1; i >= 0; i--) {
+        const int64_t wide = i == GSF__AMT_SCALES - 1 ? 2 * channels[i] + 1 : 3 * channels[i] + 4;
+        GSF__TRY(gsf__amt_bind_decoder(loader, i, wide, i ? channels[i - 1] + 4 : 8 * GSF__AMT_FLOWS, &net->decoders[i]));
+        if (i) GSF__TRY(gsf__amt_bind_update(loader, i, channels[i - 1], &net->updates[i]));
+    }
+    GSF__TRY(gsf__amt_need_prelu(loader, &net->merge[0], 3 * GSF__AMT_FLOWS, "comb_block"));
+    GSF__TRY(gsf__amt_need(loader, &net->merge[1].conv, net->merge[0].conv.weight->shape[0], 3, "comb_block.2"));
+    return net->merge[1].conv.weight->shape[0] == 3 ? GSF_OK : gsf__amt_wrong(loader, net->merge[1].conv.weight);
+}
+
+static gsf_result gsf__amt_open(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
+    gsf__amt* net = (gsf__amt*)state;
+    gsf__nn_loader loader;
+    GSF__TRY(gsf_nn_load_weights(ctx, metric->models, "amt-s", &net->weights));
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
+    return gsf__nn_end_loading(&loader, gsf__amt_bind(&loader, net));
+}
+
+static void gsf__amt_close(gsf_context* ctx, void* state) {
+    gsf__amt* net = (gsf__amt*)state;
+    for (int i = 0; i < GSF__AMT_ROOMS; i++) gsf__nn_destroy_workspace(ctx, &net->rooms[i]);
+    gsf__nn_destroy_workspace(ctx, &net->conv);
+    gsf_destroy_image(ctx, &net->even);
+    gsf_destroy_image(ctx, &net->odd);
+    gsf_destroy_image(ctx, &net->middle);
+    gsf_nn_destroy_weights(ctx, &net->weights);
+}
+
+// ---- metrics: motion smoothness (VBench)
+
+// Every second frame is compared with the one that AMT-S puts between its neighbours: the score is 1 less the mean absolute
+// difference of 8-bit values (interpolated ones are cut off, not rounded), over 255.
+
+// The frame between two (u8, packed) of one size, u8.
+static gsf_result gsf__amt_middle(gsf_context* ctx, gsf__amt* net, const gsf_image* a, const gsf_image* b, gsf_image* out) {
+    gsf__amt_pair pair;
+    gsf__map middle;
+    memset(&pair, 0, sizeof pair);
+    net->ctx = ctx;
+    net->room = 0;
+    GSF__TRY(gsf__amt_pad(net, a, b, &pair));
+    GSF__TRY(gsf__amt_interpolate(net, &pair, &middle));
+    gsf__amt_reveal(net, "middle", 0, &middle);
+    const int64_t left = (middle.width - a->width) / 2, top = (middle.height - a->height) / 2;
+    uint8_t* to = (uint8_t*)out->data;
+    for (int64_t y = 0; y < a->height; y++)
+        for (int64_t i = 0; i < a->width * 3; i++) {
+            const float v = 255.0f * middle.data[((y + top) * middle.width + left) * 3 + i];
+            if (v != v) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: the interpolated frame is not finite", net->weights.name);
+            *to++ = (uint8_t)(v > 0.0f ? (v < 255.0f ? v : 255.0f) : 0.0f);
+        }
+    return GSF_OK;
+}
+
+static gsf_result gsf__amt_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                   const gsf_image* reference) {
+    gsf__amt* net = (gsf__amt*)metric->state;
+    const int64_t w = frame->width, h = frame->height;
+    (void)reference;
+    net->tap = metric->_tap;
+    if (!net->even.data) {
+        GSF__TRY(gsf_make_image(ctx, GSF_U8, w, h, 3, &net->even));
+        GSF__TRY(gsf_make_image(ctx, GSF_U8, w, h, 3, &net->odd));
+        GSF__TRY(gsf_make_image(ctx, GSF_U8, w, h, 3, &net->middle));
+    }
+    if (w != net->even.width || h != net->even.height || !net->middle.data)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "motion smoothness: a frame of %lld x %lld after one of %lld x %lld",
+                        (long long)w, (long long)h, (long long)net->even.width, (long long)net->even.height);
+    if (net->frames % 2 || net->frames == 0) {
+        GSF__TRY(gsf_convert_image(ctx, frame, net->frames ? &net->odd : &net->even));
+    } else {
+        gsf_image now;
+        uint64_t sum = 0;
+        const uint8_t *x = (const uint8_t*)net->middle.data, *y = (const uint8_t*)net->odd.data;
+        memset(&now, 0, sizeof now);
+        GSF__TRY(gsf_make_image(ctx, GSF_U8, w, h, 3, &now));
+        gsf_result result = gsf_convert_image(ctx, frame, &now);
+        if (!result) result = gsf__amt_middle(ctx, net, &net->even, &now, &net->middle);
+        if (result) {
+            gsf_destroy_image(ctx, &now);
+            return result;
+        }
+        gsf_destroy_image(ctx, &net->even);
+        net->even = now;
+        for (int64_t i = 0; i < 3 * w * h; i++) sum += (uint64_t)(x[i] > y[i] ? x[i] - y[i] : y[i] - x[i]);
+        metric->last = (double)sum / (3.0 * (double)w * (double)h);
+        net->sum += metric->last;
+        metric->score = 1.0 - net->sum / (double)(net->frames / 2) / 255.0;
+    }
+    metric->count = ++net->frames;
+    return GSF_OK;
+}
+
 // ---- metrics: streams of frames
 
 static gsf_result gsf__lpips_open_metric(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
@@ -14946,6 +15774,7 @@ static const struct gsf__metric_form { // by kind
     {sizeof(gsf__lpips), gsf__lpips_open_metric, gsf__lpips_measure, gsf__lpips_close},
     {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
     {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
+    {sizeof(gsf__amt), gsf__amt_open, gsf__amt_measure, gsf__amt_close},
 };
 
 static gsf_result gsf__metric_open(gsf_context* ctx, gsf_nn_metric* metric) {

@@ -124,8 +124,8 @@ static const option_spec option_specs[] = {
      "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage; with --models lpips_alex, lpips_vgg, lpips_squeeze on images in\n"
-     "[-1,1], lpips_alex_raw ... on images in [0,1]; i2v_subject, i2v_background: DIR_A as a clip, against the first picture\n"
-     "of DIR_B (default psnr,ssim_3dgs)"},
+     "[-1,1], lpips_alex_raw ... on images in [0,1]; i2v_subject, i2v_background and motion_smoothness measure DIR_A\n"
+     "as a clip, the first two against the first picture of DIR_B (default psnr,ssim_3dgs)"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
@@ -931,6 +931,7 @@ static const metric_spec metric_specs[] = {
     {"lpips_squeeze_raw", GSF_NN_METRIC_LPIPS_SQUEEZE, 1, 0},
     {"i2v_subject", GSF_NN_METRIC_I2V_SUBJECT, 0, 1},
     {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND, 0, 1},
+    {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS, 0, 1},
 };
 enum { METRIC_COUNT = sizeof metric_specs / sizeof *metric_specs };
 

@@ -7,6 +7,7 @@
 #include "test_hooks.h"
 
 #include "metricnets_golden.h"
+#include "metricnets_amt.h"
 #include "metricnets_i2v.h"
 #include "metricnets_pth.h"
 
@@ -14,5 +15,6 @@ int main(void) {
     check_pth();
     check_dino();
     check_dreamsim();
+    check_amt();
     return test_report();
 }
