@@ -1,6 +1,6 @@
-// scene_trace.h - nearest hits and shadows in a mesh of triangles: by Embree if GSF_USE_EMBREE is defined, else by a bounding
-// volume hierarchy of its own. Both find the same surfaces; hit distances may differ in the last bit. Part of make_scene.c.
-// SPDX-License-Identifier: MIT
+// scene_trace.h - nearest hits and shadows in a mesh of triangles: by Embree if GSF_USE_EMBREE is defined, else by a
+// bounding volume hierarchy of its own. Both find the same surfaces; hit distances may differ in the last bit. Part of
+// make_scene.c. SPDX-License-Identifier: MIT
 #ifndef SCENE_TRACE_H
 #define SCENE_TRACE_H
 
@@ -101,7 +101,8 @@ static int find_nearest(const tracer* t, v3 from, v3 d, float near, crossing* ou
 
 #else
 
-// Inner nodes have their children at `first` and `first` + 1; leaves, with a count above 0, have triangles from `first` on.
+// Inner nodes have their children at `first` and `first` + 1; leaves, with a count above 0, have triangles from `first`
+// on.
 typedef struct bvh_node { v3 lo; uint32_t first; v3 hi; uint32_t count; } bvh_node;
 typedef struct bvh_triangle { v3 at, edge_u, edge_v; uint32_t index; } bvh_triangle;
 typedef struct tracer { bvh_node* nodes; bvh_triangle* triangles; } tracer;

@@ -6,9 +6,10 @@
 #include "../examples/make_scene.c"
 
 static void remove_scene(const char* folder, int views) {
-    static const char* const files[] = {"sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin",
-                                        "truth/visibility.bin", "truth/scene.json", "sparse/0", "sparse", "images", "truth",
-                                        ""};
+    static const char* const files[] = {
+        "sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "truth/visibility.bin", "truth/scene.json",
+        "splits/test.txt", "splits/train_3.txt", "splits/train_6.txt", "splits/train_9.txt", "splits", "sparse/0", "sparse",
+        "images", "truth", ""};
     char path[1200];
     for (int i = 0; i < views; i++) {
         snprintf(path, sizeof path, "%s/images/frame_%03d.png", folder, i + 1);

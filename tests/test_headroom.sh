@@ -35,6 +35,10 @@ cmp again/normal/00001.npy "$scene/truth/normal_002.npy" || fail "not the truth'
 "$build/oracle" cameras drift drift.json
 "$build/make_scene" drift --render drift.json --out drifted
 cmp drifted/00002.png drift/images/frame_003.png || fail "not the exposure of the scene"
+"$build/make_scene" named --scene hotel --views 3 --width 48 --height 32 --points 50
+"$build/oracle" cameras named named.json
+"$build/make_scene" named --render named.json --out again_named
+cmp again_named/00001.png named/images/frame_002.png || fail "a scene of the benchmark renders differently"
 for stops in 9 -1 nan x; do
     if "$build/make_scene" wrong --drift $stops 2> log; then fail "takes --drift $stops"; fi
     grep -q '^usage: ' log && [ ! -e wrong ] || fail "--drift $stops"

@@ -1,5 +1,5 @@
-// test_make_scene.c - the true depth and normals of examples/make_scene.c against surfaces of known equations, and that
-// neither they nor the photos depend on the number of threads.
+// test_make_scene.c - the true depth and normals of examples/make_scene.c against surfaces of known equations; that neither
+// they nor the photos depend on the number of threads; that the scenes of the family are sound and differ.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests -DGSFIXER_IMPLEMENTATION tests/test_make_scene.c -lm; also with -DGSF_USE_EMBREE
 #define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
@@ -132,6 +132,102 @@ static void test_files(gsf_context* ctx, make_scene_options* o) {
     remove_scene(folder, o->views);
 }
 
+// At the poles of a sphere, too, the normals point outwards.
+static void test_poles(void) {
+    static const float sphere[4] = {0.5f, 1, 0, 0};
+    const place at = {{0, 0, 0}, 0.3f};
+    world s;
+    float worst = 1.0f;
+    memset(&s, 0, sizeof s);
+    s.layout = 1;
+    add_patch(&s, patch_sphere, sphere, 28, 18, ENAMEL, 0, at);
+    CHECK(!s.failed && s.vertex_count == 29 * 19);
+    for (size_t i = 0; i < s.vertex_count; i++) worst = minf(worst, dot(s.vertices[i].normal, unit(s.vertices[i].at)));
+    CHECK(worst > 0.99f);
+    end_world(&s);
+}
+
+// A letter has ink on its strokes and none beside them.
+static void test_letters(void) {
+    CHECK(ink_of("I", 0.5f, 1.5f, 0.1f, 0.01f) > 0.99f && ink_of("I", 0.1f, 1.0f, 0.1f, 0.01f) < 0.01f);
+    CHECK(ink_of("HO", 2.0f, 2.0f, 0.1f, 0.01f) > 0.99f && ink_of("HO", 2.0f, 1.0f, 0.1f, 0.01f) < 0.01f);
+    CHECK(ink_of("HO", 3.5f, 1.0f, 0.1f, 0.01f) < 0.01f && ink_of("H O", 2.0f, 1.0f, 0.1f, 0.01f) < 0.01f);
+}
+
+typedef struct sight { double mean[3 * 6 * 8]; } sight; // a photo of 96 x 72 in blocks of 12 x 12
+
+static sight blurred(const truth* photo) {
+    sight out;
+    memset(&out, 0, sizeof out);
+    for (size_t i = 0; i < PIXELS; i++)
+        for (size_t k = 0; k < 3; k++)
+            out.mean[3 * (i / WIDTH / 12 * 8 + i % WIDTH / 12) + k] += photo->pixels[3 * i + k] / 144.0;
+    return out;
+}
+
+// A photo that is neither dark, nor blank, nor taken from inside of something, with the truth beside it.
+static void check_photo(const gsf_camera* camera, const truth* photo) {
+    double sum = 0.0, squares = 0.0;
+    size_t hits = 0;
+    for (size_t i = 0; i < PIXELS; i++) {
+        const double x = photo->pixels[3 * i + 1];
+        const float *n = photo->normal + 3 * i, depth = photo->depth[i];
+        sum += x, squares += x * x;
+        if (depth == 0.0f) continue;
+        float z;
+        const v3 d = ray_through(camera, (double)(i % WIDTH) + 0.5, (double)(i / WIDTH) + 0.5, &z);
+        hits++;
+        CHECK(depth > 0.12f);
+        CHECK_NEAR(n[0] * n[0] + n[1] * n[1] + n[2] * n[2], 1.0f, 1e-4);
+        CHECK(dot(v(n[0], n[1], n[2]), d) <= 1e-6f);
+    }
+    const double mean = sum / PIXELS, deviation = sqrt(squares / PIXELS - mean * mean);
+    CHECK(hits > PIXELS / 2);
+    if (!CHECK(mean > 45.0 && mean < 215.0 && deviation > 18.0)) printf("mean %.1f, deviation %.1f\n", mean, deviation);
+}
+
+// A scene of every layout: sound photos, no two alike, the same for any order of the work.
+static void test_family(gsf_context* ctx, gsf_context* reversed) {
+    static sight seen[LAYOUTS];
+    static truth photo, other;
+    size_t count = 0;
+    double least = INFINITY;
+    for (int i = 1; i < LAYOUTS; i++) {
+        make_scene_options o = make_scene_defaults;
+        world s, again;
+        o.width = WIDTH, o.height = HEIGHT, o.views = VIEWS;
+        o.layout = i, o.seed = 200 + (uint64_t)i;
+        memset(&s, 0, sizeof s);
+        memset(&again, 0, sizeof again);
+        if (!CHECK(start_world(ctx, &s, &o))) return;
+        for (int view = 1; view < VIEWS; view += 2) {
+            const gsf_camera camera = camera_of(&s, &o, view);
+            take(ctx, &s, &camera, 1.0f, &photo);
+            check_photo(&camera, &photo);
+        }
+        const gsf_camera camera = camera_of(&s, &o, VIEWS / 2);
+        take(ctx, &s, &camera, 1.0f, &photo);
+        seen[count++] = blurred(&photo);
+        if (i % 5 == 0) {
+            CHECK(start_world(reversed, &again, &o));
+            const gsf_camera same = camera_of(&again, &o, VIEWS / 2);
+            CHECK(memcmp(&same, &camera, sizeof same) == 0);
+            take(reversed, &again, &same, 1.0f, &other);
+            CHECK(memcmp(&photo, &other, sizeof photo) == 0);
+            end_world(&again);
+        }
+        end_world(&s);
+    }
+    for (size_t a = 0; a < count; a++)
+        for (size_t b = 0; b < a; b++) {
+            double sum = 0.0;
+            for (size_t k = 0; k < 3 * 6 * 8; k++) sum += fabs(seen[a].mean[k] - seen[b].mean[k]);
+            least = fmin(least, sum / (3 * 6 * 8));
+        }
+    printf("%zu scenes, the most alike differ by %.1f of 255\n", count, least);
+    CHECK(least > 6.0);
+}
+
 int main(void) {
     static truth one, other;
     gsf_context ctx, reversed;
@@ -169,5 +265,8 @@ int main(void) {
     end_world(&s);
     end_world(&again);
     test_files(&ctx, &o);
+    test_poles();
+    test_letters();
+    test_family(&ctx, &reversed);
     return test_report();
 }
