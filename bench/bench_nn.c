@@ -15,6 +15,7 @@
 // (make_model writes such a folder; the released size takes hours here). --pipeline restores a clip with a small model,
 // with every solver, fewer steps and each option that skips work: run time and error of the frames. Further folders
 // hold the same weights in other dtypes.
+#define GSF_NN_TRAINING
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
@@ -839,6 +840,146 @@ static char* bench_make_weights(gsf_context* ctx, bench_weights* w, gsf_nn_dtype
     return w->memory;
 }
 
+// ---- gradients ------------------------------------------------------------------------
+
+typedef struct bench_gradient { // of one layer; unused ones are zero
+    gsf__nn_attention_desc attention;
+    gsf__nn_attention_grad_desc attention_grad;
+    gsf__nn_linear_grad_desc linear;
+    gsf__nn_conv_desc conv;
+    gsf__nn_conv_grad_desc conv_grad;
+    gsf_nn_tensor weight;
+} bench_gradient;
+
+static void bench_run_gradient(gsf_context* ctx, void* arg) {
+    const bench_gradient* g = (const bench_gradient*)arg;
+    if (g->attention.q) bench_require(ctx, gsf__nn_attention_grad(ctx, &g->attention_grad));
+    else if (g->linear.x) bench_require(ctx, gsf__nn_linear_grad(ctx, &g->linear));
+    else bench_require(ctx, gsf__nn_conv_grad(ctx, &g->conv_grad));
+}
+
+// dq of three queries of the last head, in double.
+static double bench_attention_grad_error(gsf_context* ctx, const bench_gradient* g, bench_row* row) {
+    const gsf__nn_attention_desc* d = &g->attention;
+    const int64_t dim = d->head_dim, width = d->heads * dim, column = width - dim;
+    double *p = (double*)bench_alloc(ctx, 2 * (size_t)d->keys, sizeof(double)), *dp = p + d->keys, square = 0.0;
+    for (int64_t look = 0; look < 3; look++) {
+        const int64_t r = look * (d->queries - 1) / 2;
+        const float *q = d->q + r * width + column, *dy = g->attention_grad.dy + r * width + column;
+        double sum = 0.0, mean = 0.0;
+        for (int64_t j = 0; j < d->keys; j++) {
+            p[j] = dp[j] = 0.0;
+            for (int64_t i = 0; i < dim; i++) {
+                p[j] += (double)q[i] * (double)d->k[j * width + column + i] / sqrt((double)dim);
+                dp[j] += (double)dy[i] * (double)d->v[j * width + column + i];
+            }
+            sum += p[j] = exp(p[j]);
+            mean += p[j] * dp[j];
+        }
+        for (int64_t i = 0; i < dim; i++) {
+            double value = 0.0;
+            for (int64_t j = 0; j < d->keys; j++)
+                value += p[j] / sum * (dp[j] - mean / sum) * (double)d->k[j * width + column + i] / sqrt((double)dim);
+            bench_add_error(row, (double)g->attention_grad.dq[r * width + column + i], value, &square);
+        }
+    }
+    gsf_free(ctx, p);
+    return square;
+}
+
+// Gradients of some weights in double; x (rows, in) and dy (rows, out) of a linear layer, or of the centre of a kernel.
+// The weights' gradients add up over the runs, so they are zeroed and computed once more.
+static double bench_weight_grad_error(gsf_context* ctx, bench_gradient* g, int64_t rows, int64_t taps, const float* x,
+                                      const float* dy, float* dweight, bench_row* row) {
+    const int64_t out = g->weight.shape[0], in = g->weight.shape[1];
+    double square = 0.0;
+    memset(dweight, 0, (size_t)g->weight.count * sizeof(float));
+    bench_run_gradient(ctx, g);
+    for (int64_t o = 0; o < out; o += out / 5)
+        for (int64_t i = 0; i < in; i += in / 5) {
+            double value = 0.0;
+            for (int64_t r = 0; r < rows; r++) value += (double)x[r * in + i] * (double)dy[r * out + o];
+            bench_add_error(row, (double)dweight[(o * in + i) * taps + taps / 2], value, &square);
+        }
+    return square;
+}
+
+// height 0: a linear layer of `width` rows, or with `heads` attention of so many tokens
+static void bench_one_gradient(const bench_options* o, gsf_cpu_level level, int threads, int32_t heads, int64_t height,
+                               int64_t width, int64_t in, int64_t out) {
+    char name[96];
+    gsf_context ctx;
+    bench_gradient g;
+    if (height) snprintf(name, sizeof name, "conv gradients f32 3x3 %lldx%lld C=%lld N=%lld", (long long)width,
+                         (long long)height, (long long)in, (long long)out);
+    else if (heads) snprintf(name, sizeof name, "attention gradients f32 H=%d D=64 S=%lld", (int)heads, (long long)width);
+    else snprintf(name, sizeof name, "linear gradients f32 M=%lld N=%lld K=%lld", (long long)width, (long long)out,
+                  (long long)in);
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    const int64_t rows = (height ? height : 1) * width, taps = height ? 9 : 1;
+    const int64_t shape[4] = {out, in, 3, 3}, all = heads ? 8 * rows * in : 2 * (rows * (in + out) + taps * in * out);
+    float* memory = (float*)bench_alloc(&ctx, (size_t)all + (size_t)heads * (size_t)width, sizeof(float));
+    bench_fill(memory, (size_t)all * sizeof(float), GSF_NN_F32, 6);
+    memset(&g, 0, sizeof g);
+    float *x = memory, *dy = x + rows * in, *dx = dy + rows * out, *dweight = dx + rows * in;
+    double flops = 4.0 * (double)rows * (double)taps * (double)in * (double)out;
+    g.weight = gsf_nn_wrap_tensor("weight", dweight + taps * in * out, height ? 4 : 2, shape);
+    if (heads) {
+        float* part = memory; // q, k, v, out, dy, dq, dk, dv
+        gsf__nn_attention_desc* a = &g.attention;
+        const gsf__nn_attention_grad_desc grad = {a, part + 4 * rows * in, part + 5 * rows * in, part + 6 * rows * in,
+                                                  part + 7 * rows * in};
+        a->queries = a->keys = width;
+        a->heads = heads;
+        a->head_dim = 64;
+        a->q = part;
+        a->k = part + rows * in;
+        a->v = part + 2 * rows * in;
+        a->out = part + 3 * rows * in;
+        a->lse = memory + all;
+        g.attention_grad = grad;
+        flops = 10.0 * (double)width * (double)width * (double)in;
+        bench_require(&ctx, gsf__nn_run_attention(&ctx, NULL, a));
+    } else if (height) {
+        g.conv.x = x;
+        g.conv.frames = 1;
+        g.conv.height = height;
+        g.conv.width = width;
+        g.conv.weight = &g.weight;
+        g.conv_grad.forward = &g.conv;
+        g.conv_grad.dy = dy;
+        g.conv_grad.dx = dx;
+        g.conv_grad.dweight = dweight;
+    } else {
+        g.linear.x = x;
+        g.linear.rows = rows;
+        g.linear.weight = &g.weight;
+        g.linear.dy = dy;
+        g.linear.dx = dx;
+        g.linear.dweight = dweight;
+    }
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_gradient, &g, 1.0);
+    row.error_max = row.error_rel_l2 = 0.0;
+    const double square = heads ? bench_attention_grad_error(&ctx, &g, &row)
+                                : bench_weight_grad_error(&ctx, &g, rows, taps, x, dy, dweight, &row);
+    row.error_rel_l2 = sqrt(row.error_rel_l2 / square);
+    row.reference = "float64";
+    bench_print(o->json, &row);
+    gsf_free(&ctx, memory);
+}
+
+static void bench_gradients(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        BENCH_EACH(level) bench_one_gradient(o, level, threads, 0, 0, 64, 256, 256);
+        bench_one_gradient(o, o->level, threads, 48, 0, 1056, 3072, 3072);
+        bench_one_gradient(o, o->level, threads, 0, 0, 1056, 3072, 3072);
+        bench_one_gradient(o, o->level, threads, 0, 240, 360, 24, 24);
+        bench_one_gradient(o, o->level, threads, 0, 60, 90, 48, 48);
+    }
+}
+
 // ---- a whole transformer block ------------------------------------------------------
 
 typedef struct bench_block {
@@ -1593,6 +1734,7 @@ int main(int argc, char** argv) {
     bench_attentions(&o);
     bench_norms(&o);
     bench_convs(&o);
+    bench_gradients(&o);
     bench_blocks(&o);
     bench_captions(&o);
     bench_t5s(&o);
