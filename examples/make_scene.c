@@ -402,6 +402,7 @@ static int make_sheet(gsf_context* ctx, int count, const char* path) {
     float* truth = (float*)gsf_alloc(ctx, pixels, 4 * sizeof(float));
     double least = INFINITY;
     int pair[2] = {1, 1}, ok = sheet && photo && truth;
+    if (!ok) fprintf(stderr, "make_scene: out of memory\n");
     for (int i = 0; ok && i < count; i++) {
         world s;
         make_scene_options o = options_of_seed(make_scene_defaults, (uint64_t)i + 1);

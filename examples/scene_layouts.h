@@ -53,7 +53,7 @@ static void build_courtyard(world* s) {
     add_patch(s, patch_lathe, vase, 48, 48, GLAZE, 0, vase_at);
     const place flowers = {{-0.16f, 0.06f, 0.96f}, 0};
     add_bush(s, flowers, 0.19f, 0.34f, 90, 31);
-    for (int i = 0; i < 4; i++) {  // books
+    for (int i = 0; i < 4; i++) { // books
         const float z = 0.645f + 0.045f * (float)i, w = 0.105f - 0.006f * (float)i;
         const place at = {{0.40f, 0.22f, z}, 0.5f + 0.45f * (float)((i * 7) % 4) - 0.3f};
         add_box(s, v(-w, -0.15f, 0), v(w, 0.15f, 0.043f), 8, BOOK, (uint32_t)i, at);
@@ -141,7 +141,7 @@ static void set_walk(world* s, float focal, v3 from, v3 to, float sway, float tu
 
 typedef struct opening {
     float x0, x1, z0, z1;
-} opening;  // of a wall; in the order of x, none overlap
+} opening; // of a wall; in the order of x, none overlap
 
 // A wall in the plane y = 0 from x = 0, facing -y. Openings have reveals; those above the floor are windows with bars.
 static void add_wall(world* s, float length, float height, material m, uint32_t seed, const opening* o, int count,
@@ -154,11 +154,11 @@ static void add_wall(world* s, float length, float height, material m, uint32_t 
         const float x0 = o[i].x0, x1 = o[i].x1, z0 = o[i].z0, z1 = o[i].z1, d = 0.22f;
         if (z0 > 0.0f) add_sheet(s, v(x0, 0, 0), v(x1 - x0, 0, 0), v(0, 0, z0), 0.22f, m, seed, where);
         add_sheet(s, v(x0, 0, z1), v(x1 - x0, 0, 0), v(0, 0, height - z1), 0.22f, m, seed, where);
-        add_sheet(s, v(x0, 0, z0), v(0, d, 0), v(0, 0, z1 - z0), 0.22f, m, seed, where);  // faces +x
-        add_sheet(s, v(x1, 0, z0), v(0, 0, z1 - z0), v(0, d, 0), 0.22f, m, seed, where);  // -x
-        add_sheet(s, v(x0, 0, z1), v(0, d, 0), v(x1 - x0, 0, 0), 0.22f, m, seed, where);  // down
+        add_sheet(s, v(x0, 0, z0), v(0, d, 0), v(0, 0, z1 - z0), 0.22f, m, seed, where); // faces +x
+        add_sheet(s, v(x1, 0, z0), v(0, 0, z1 - z0), v(0, d, 0), 0.22f, m, seed, where); // -x
+        add_sheet(s, v(x0, 0, z1), v(0, d, 0), v(x1 - x0, 0, 0), 0.22f, m, seed, where); // down
         if (z0 > 0.0f) {
-            add_block(s, v(x0 - 0.05f, -0.06f, z0 - 0.04f), v(x1 + 0.05f, d, z0), 0.2f, ENAMEL, WHITE, where);  // sill
+            add_block(s, v(x0 - 0.05f, -0.06f, z0 - 0.04f), v(x1 + 0.05f, d, z0), 0.2f, ENAMEL, WHITE, where); // sill
             for (int k = 0; k <= 2; k++) {
                 const float bar = x0 + (x1 - x0) * 0.5f * (float)k, rail = z0 + (z1 - z0) * 0.5f * (float)k;
                 add_block(s, v(bar - 0.025f, d - 0.06f, z0), v(bar + 0.025f, d - 0.02f, z1), 0.3f, ENAMEL, WHITE,
@@ -198,7 +198,7 @@ static void add_room(world* s, const room* r, const opening* windows[4], const i
         const place where = wall_of(r, side);
         const float length = wall_length(r, side);
         add_wall(s, length, r->height, r->walls, r->seed, windows[side], counts[side], where);
-        float x = 0.0f;  // skirting, except at doors
+        float x = 0.0f; // skirting, except at doors
         for (int i = 0; i <= counts[side]; i++) {
             const int door = i < counts[side] && windows[side][i].z0 <= 0.0f;
             if (i < counts[side] && !door) continue;
@@ -210,7 +210,7 @@ static void add_room(world* s, const room* r, const opening* windows[4], const i
     }
 }
 
-static void add_outdoors(world* s, float half, material m, uint32_t seed) {  // the ground, finer in the middle
+static void add_outdoors(world* s, float half, material m, uint32_t seed) { // the ground, finer in the middle
     const place here = place_at(0, 0, 0, 0);
     add_sheet(s, v(-0.35f * half, -0.35f * half, 0), v(0.7f * half, 0, 0), v(0, 0.7f * half, 0), 0.008f * half, m, seed,
               here);
@@ -233,11 +233,11 @@ static void add_house_window(world* s, float x, float z, float width, float heig
                   style & 1 ? ASHLAR : ENAMEL, WHITE, where);
         add_block(s, v(x - 0.5f * width - 0.13f, i < 0 ? -0.16f : -0.09f, level - b),
                   v(x + 0.5f * width + 0.13f, 0, level + b), 0.5f, style & 1 ? ASHLAR : ENAMEL, WHITE, where);
-        if (style & 2)  // shutters
+        if (style & 2) // shutters
             add_panel(s, v(x + (float)i * (0.74f * width + 0.08f), -0.05f, z), v(1, 0, 0), v(0, 0, 1), 0.42f * width,
                       height, SHUTTER, seed & ~63u, where);
     }
-    if (style & 4) {  // flowers
+    if (style & 4) { // flowers
         add_block(s, v(x - 0.45f * width, -0.30f, z - 0.5f * height),
                   v(x + 0.45f * width, -0.12f, z - 0.5f * height + 0.15f), 0.3f, TERRACOTTA, 1, where);
         add_crown(s, v(0.45f * width, 0.12f, 0.14f), 90, 0.10f, draw_seed(s), 0.45f,
@@ -245,7 +245,7 @@ static void add_house_window(world* s, float x, float z, float width, float heig
     }
 }
 
-static void add_shop(world* s, float width, uint32_t seed, place where) {  // its ground floor
+static void add_shop(world* s, float width, uint32_t seed, place where) { // its ground floor
     const float glass = 0.5f * width - 0.9f, door = 0.5f * width;
     add_block(s, v(0.15f, -0.12f, 2.55f), v(width - 0.15f, 0, 3.05f), 0.4f, WOOD, seed, where);
     add_panel(s, v(0.5f * width, -0.125f, 2.80f), v(1, 0, 0), v(0, 0, 1), 0.86f * width, 0.44f, SIGN, seed, where);
@@ -255,7 +255,7 @@ static void add_shop(world* s, float width, uint32_t seed, place where) {  // it
         add_block(s, v(x - 0.5f * glass, -0.10f, 0), v(x + 0.5f * glass, 0, 0.55f), 0.4f, WOOD, seed, where);
     }
     add_panel(s, v(door, -0.03f, 1.15f), v(1, 0, 0), v(0, 0, 1), 1.0f, 2.3f, DOOR, seed, where);
-    if (seed & 2u) {  // awning
+    if (seed & 2u) { // awning
         const v3 top = v(0.3f, -0.12f, 2.5f), edge = v(width - 0.6f, 0, 0), out = v(0, -1.0f, -0.42f);
         add_sheet(s, add(top, out), edge, mul(out, -1.0f), 0.2f, FABRIC, fabric_of(seed, 1), where);
         add_sheet(s, add(add(top, out), v(0, 0, -0.18f)), edge, v(0, 0, 0.18f), 0.2f, FABRIC, fabric_of(seed, 1),
@@ -265,7 +265,7 @@ static void add_shop(world* s, float width, uint32_t seed, place where) {  // it
                      add(add(top, out), v((float)i * (width - 0.7f) + 0.05f, 0, 0)), 0.012f, 0.012f, 5, METAL, 1,
                      where);
     }
-    if (seed & 4u) {  // a sign that hangs out
+    if (seed & 4u) { // a sign that hangs out
         const float x = width - 0.35f;
         add_tube(s, v(x, 0, 3.45f), v(x, -0.85f, 3.45f), 0.015f, 0.015f, 6, METAL, 2, where);
         add_tube(s, v(x, 0, 3.15f), v(x, -0.6f, 3.45f), 0.010f, 0.010f, 6, METAL, 2, where);
@@ -276,7 +276,7 @@ static void add_shop(world* s, float width, uint32_t seed, place where) {  // it
 }
 
 static float add_house(world* s, float width, int floors, int shop,
-                       place where) {  // front in y = 0 from x = 0; returns its height
+                       place where) { // front in y = 0 from x = 0; returns its height
     static const material fronts[4] = {CLAY_BRICK, WALL, ASHLAR, WALL};
     const uint32_t seed = draw_seed(s);
     const float ground = 3.2f, storey = 2.8f, height = ground + storey * (float)(floors - 1) + 0.3f;
@@ -315,7 +315,7 @@ static float add_house(world* s, float width, int floors, int shop,
         add_block(s, v(door - 0.78f, -0.35f, 2.35f), v(door + 0.78f, 0, 2.5f), 0.3f, ASHLAR, seed, where);
         add_block(s, v(door - 0.75f, -0.6f, 0), v(door + 0.75f, 0, 0.14f), 0.3f, ASHLAR, seed, where);
     }
-    if (floors > 2 && seed & 32u) {  // balcony
+    if (floors > 2 && seed & 32u) { // balcony
         const float x = 0.5f * width - 0.9f, z = ground + 0.02f;
         add_block(s, v(x - 0.1f, -0.85f, z - 0.1f), v(x + 1.9f, 0, z), 0.2f, ASHLAR, seed, where);
         add_railing(s, 1.8f, 0.9f, 0.11f, 0.009f, METAL, seed, within(where, x, -0.8f, z, 0));
@@ -335,7 +335,7 @@ static void add_row_of_houses(world* s, float length, int shops, place where) {
     }
 }
 
-static void add_chalkboard(world* s, place where) {  // on legs, faces -y
+static void add_chalkboard(world* s, place where) { // on legs, faces -y
     const uint32_t seed = draw_seed(s);
     for (int i = -1; i <= 1; i += 2) {
         const v3 up = unit(v(0, 0.22f * (float)-i, 1.0f));
@@ -437,10 +437,10 @@ static void build_living_room(world* s) {
     scatter(s, 4, 1.0f, 0.55f, 0.2f, place_at(-0.1f, 0.4f, 0.421f, 0.1f));
     add_standing_lamp(s, 1.6f, draw(s, 0.5f, 1.4f), within(north, 2 * r.x - 0.45f, -0.45f, 0, 0));
     add_potted_plant(s, 1.5f, within(north, 0.4f, -0.4f, 0, 0));
-    for (int i = 0; i < 3; i++)  // above the sofa
+    for (int i = 0; i < 3; i++) // above the sofa
         hang_panel(s, v(r.x - 1.0f + 0.85f * (float)i, -0.02f, 1.62f), -0.5f * half_turn, draw(s, 0.5f, 0.75f),
                    draw(s, 0.5f, 0.85f), i == 1 && seed & 2u ? MIRROR : PICTURE, draw_seed(s), north);
-    const place shelf = within(west, mid - 1.2f, -0.3f, 0, 0);  // bookcase
+    const place shelf = within(west, mid - 1.2f, -0.3f, 0, 0); // bookcase
     for (int i = 0; i <= 5; i++)
         add_block(s, v(0, 0, 0.38f * (float)i), v(2.2f, 0.29f, 0.38f * (float)i + 0.025f), 0.15f, WOOD, seed + 2u,
                   shelf);
@@ -455,7 +455,7 @@ static void build_living_room(world* s) {
                 add_trinket(s, draw(s, 0.2f, 0.28f),
                             within(shelf, x + 0.2f + 0.33f * (float)k, 0.14f, z, draw(s, -1, 1)));
     }
-    for (int i = -1; i <= 1; i += 2) {  // curtains
+    for (int i = -1; i <= 1; i += 2) { // curtains
         const float shape[4] = {0.55f, 2.2f, 0.05f, 6.0f};
         add_patch(s, patch_drape, shape, 60, 12, FABRIC, seed + 8u,
                   within(east, mid - 0.1f + 1.45f * (float)i, -0.1f, 0.08f, 0));
@@ -494,7 +494,7 @@ static void build_corridor(world* s) {
             int at_window = 0;
             for (int k = 0; !w && k < counts[1]; k++) at_window |= x + 0.7f > side[k].x0 && x - 0.7f < side[k].x1;
             if (at_window) continue;
-            if ((i + w) % 2 == 0) {  // a door in its frame
+            if ((i + w) % 2 == 0) { // a door in its frame
                 add_panel(s, v(x, -0.03f, 1.03f), v(1, 0, 0), v(0, 0, 1), 0.9f, 2.04f, DOOR, seed + (uint32_t)w, wall);
                 for (int k = -1; k <= 1; k += 2)
                     add_block(s, v(x + 0.5f * (float)k - 0.05f, -0.07f, 0), v(x + 0.5f * (float)k + 0.05f, 0, 2.1f),
@@ -509,12 +509,12 @@ static void build_corridor(world* s) {
                            draw_seed(s), wall);
                 if (kind == 2)
                     add_railing(s, 0.9f, 0.6f, 0.06f, 0.018f, ENAMEL, WHITE,
-                                within(wall, x - 0.45f, -0.1f, 0.12f, 0));  // radiator
+                                within(wall, x - 0.45f, -0.1f, 0.12f, 0)); // radiator
                 else if (kind == 3) add_chair(s, seed, within(wall, x, -0.3f, 0, half_turn));
                 else add_potted_plant(s, draw(s, 0.8f, 1.2f), within(wall, x, -0.28f, 0, 0));
             }
         }
-        for (int i = 0; i < 2; i++)  // pipes and a cable
+        for (int i = 0; i < 2; i++) // pipes and a cable
             add_tube(s, v(0, -0.12f - 0.1f * (float)i, r.height - 0.18f),
                      v(14, -0.12f - 0.1f * (float)i, r.height - 0.18f), 0.03f, 0.03f, 8, i ? METAL : ENAMEL, seed,
                      wall);
@@ -522,7 +522,7 @@ static void build_corridor(world* s) {
             add_cable(s, v(2.0f * (float)i, -0.05f, r.height - 0.35f),
                       v(2.0f * (float)i + 2.0f, -0.05f, r.height - 0.35f), 0.008f, 0.08f, METAL, wall);
     }
-    for (int i = 0; i < 5; i++) {  // lamps
+    for (int i = 0; i < 5; i++) { // lamps
         const float y = -5.6f + 2.8f * (float)i;
         add_block(s, v(-0.3f, y - 0.45f, r.height - 0.05f), v(0.3f, y + 0.45f, r.height), 0.2f, GLOW, seed,
                   place_at(0, 0, 0, 0));
@@ -571,7 +571,7 @@ static void build_bookshelf(world* s) {
         add_trinket(
             s, draw(s, 0.26f, 0.34f),
             within(shelf, width * ((float)i + 0.5f) / 4.0f, 0.15f, step * (float)rows + 0.026f, draw(s, -0.5f, 0.5f)));
-    const v3 foot = v(draw(s, 0.5f, width - 0.9f), -0.55f, 0), head = v(foot.x + 0.04f, -0.03f, 2.15f);  // ladder
+    const v3 foot = v(draw(s, 0.5f, width - 0.9f), -0.55f, 0), head = v(foot.x + 0.04f, -0.03f, 2.15f); // ladder
     for (int i = 0; i < 2; i++)
         add_tube(s, add(foot, v(0.38f * (float)i, 0, 0)), add(head, v(0.38f * (float)i, 0, 0)), 0.017f, 0.017f, 8, WOOD,
                  seed + 3u, shelf);
@@ -612,13 +612,13 @@ static void build_street(world* s) {
             if (draw(s, 0, 1) < 0.6f)
                 add_fruit_crate(s, within(side, x + 2.6f, half - 0.4f, 0.12f, draw(s, -0.2f, 0.2f)));
         }
-        for (int k = 0; k < 8; k++) {  // bollards
+        for (int k = 0; k < 8; k++) { // bollards
             const float x = -13.0f + 3.5f * (float)k;
             add_tube(s, v(x, half - 1.2f, 0.1f), v(x, half - 1.2f, 0.85f), 0.06f, 0.05f, 12, METAL, 4, side);
             add_ball(s, 0.07f, METAL, 4, within(side, x, half - 1.2f, 0.88f, 0));
         }
     }
-    for (int k = 0; k < 5; k++) {  // wires and lanterns across the street
+    for (int k = 0; k < 5; k++) { // wires and lanterns across the street
         const float x = -11.0f + 5.0f * (float)k, z = draw(s, 4.2f, 5.6f);
         add_cable(s, v(x, -half, z), v(x + draw(s, -1, 1), half, z + draw(s, -0.4f, 0.4f)), 0.012f, 0.35f, METAL, here);
         add_cable(s, v(x + 0.5f, -half, z + 0.5f), v(x + 3.0f, half, z), 0.010f, 0.5f, METAL, here);
@@ -659,7 +659,7 @@ static void build_garden(world* s) {
     const place here = place_at(0, 0, 0, 0);
     set_daylight(s, -1.0f, 1.2f);
     add_outdoors(s, 11.0f, GRASS, seed);
-    for (int i = 0; i < 14; i++) {  // a path of stones
+    for (int i = 0; i < 14; i++) { // a path of stones
         const float x = -4.6f + 0.72f * (float)i, shape[4] = {0.27f, 0.16f, 0.25f, (float)i};
         add_patch(s, patch_sphere, shape, 22, 12, GRANITE, seed,
                   place_at(x, -1.5f + 0.45f * sinf(1.1f * x), 0.0f, (float)i));
@@ -675,10 +675,10 @@ static void build_garden(world* s) {
         add_flowers(s, draw(s, 1.4f, 2.2f), 0.7f, 55,
                     place_at(2.0f * cosf(a), 2.0f * sinf(a), 0, a + 0.5f * half_turn));
     }
-    add_lathe(s, profiles[5], 0.3f, 0.85f, 32, 32, MARBLE, seed, here);  // bird bath
+    add_lathe(s, profiles[5], 0.3f, 0.85f, 32, 32, MARBLE, seed, here); // bird bath
     add_lathe(s, profiles[2], 0.42f, 0.16f, 40, 24, MARBLE, seed, place_at(0, 0, 0.78f, 0));
     add_disc(s, 0.36f, 0.90f, MIRROR, 0, here);
-    add_ball(s, 0.16f, CHROME, 1, place_at(-1.0f, 0.7f, 0.62f, 0));  // a gazing ball
+    add_ball(s, 0.16f, CHROME, 1, place_at(-1.0f, 0.7f, 0.62f, 0)); // a gazing ball
     add_lathe(s, profiles[5], 0.15f, 0.48f, 20, 20, METAL, seed, place_at(-1.0f, 0.7f, 0, 0));
     add_bench(s, seed, place_at(0.2f, 3.5f, 0, half_turn));
     add_tree(s, 2.9f, 900, place_at(2.9f, 1.9f, 0, 1));
@@ -687,14 +687,14 @@ static void build_garden(world* s) {
                          place_at(1.5f * cosf(1.4f * (float)i + 0.8f), 1.4f * sinf(1.4f * (float)i + 0.8f), 0, 0));
     add_crown(s, v(0.5f, 0.45f, 0.42f), 700, 0.09f, draw_seed(s), 0.2f, place_at(-1.7f, -0.4f, 0.38f, 0));
     add_crown(s, v(0.4f, 0.4f, 0.35f), 500, 0.08f, draw_seed(s), 0.3f, place_at(1.2f, -0.7f, 0.3f, 0));
-    for (int i = 0; i < 7; i++) {  // bushes before the hedges
+    for (int i = 0; i < 7; i++) { // bushes before the hedges
         const float a = 0.9f * (float)i + draw(s, -0.25f, 0.25f), size = draw(s, 0.35f, 0.65f);
-        if (sinf(a) < -0.5f) continue;  // where the camera is
+        if (sinf(a) < -0.5f) continue; // where the camera is
         add_crown(s, v(size, size, 0.9f * size), 520, 0.08f, draw_seed(s), draw(s, -0.1f, 0.45f),
                   place_at(4.1f * cosf(a), 4.1f * sinf(a), 0.8f * size, 0));
     }
     const uint32_t grass = draw_seed(s) / 7u * 7u + 6u;
-    for (int i = 0; i < 3000; i++) {  // tufts
+    for (int i = 0; i < 3000; i++) { // tufts
         const v3 at = v(draw(s, -4.5f, 4.5f), draw(s, -2.8f, 4.5f), 0);
         add_leaf(s, at, unit(add(draw_direction(s, 0.3f), v(0, 0, 0.7f))), draw(s, 0.05f, 0.13f), 0.012f, FOLIAGE,
                  grass << 16 | (uint32_t)i, here);
@@ -726,7 +726,7 @@ static void build_monument(world* s) {
     }
     z += 1.32f;
     switch ((seed >> 8) % 4u) {
-        case 0:  // obelisk
+        case 0: // obelisk
             for (int i = 0; i < 4; i++) {
                 const place side = within(here, 0, 0, z, 0.5f * half_turn * (float)i);
                 const float a = 0.36f, b = 0.2f, h = 2.3f;
@@ -740,7 +740,7 @@ static void build_monument(world* s) {
             add_patch(s, patch_knot, (const float[4]){0.8f, 0.17f, 2, 3}, 24, 200, figure, seed,
                       within(here, 0, 0, z, 0));
             break;
-        case 2: {  // a figure
+        case 2: { // a figure
             static const float robe[] = {9,     0.42f, 0,     0.45f, 0.05f, 0.36f, 0.5f, 0.27f, 0.95f, 0.31f,
                                          1.25f, 0.29f, 1.42f, 0.12f, 1.55f, 0.09f, 1.6f, 0.09f, 1.65f};
             add_lathe(s, robe, 0.45f, 1.65f, 44, 60, figure, seed, within(here, 0, 0, z, 0));
@@ -755,12 +755,12 @@ static void build_monument(world* s) {
             add_ball(s, 0.13f, CHROME, 1, within(here, -0.42f, 0.26f, z + 0.88f, 0));
             break;
         }
-        default:  // a great vase with a plant
+        default: // a great vase with a plant
             add_lathe(s, profiles[0], 0.55f, 1.1f, 48, 48, figure == METAL ? GLASSY : figure, seed,
                       within(here, 0, 0, z, 0));
             add_crown(s, v(0.55f, 0.55f, 0.45f), 700, 0.13f, draw_seed(s), 0.25f, within(here, 0, 0, z + 1.35f, 0));
     }
-    for (int i = 0; i < 8; i++) {  // posts and chains
+    for (int i = 0; i < 8; i++) { // posts and chains
         const float a = 0.25f * half_turn * (float)i + 0.39f, b = a + 0.25f * half_turn;
         const v3 p = v(2.9f * cosf(a), 2.9f * sinf(a), 0.62f), q = v(2.9f * cosf(b), 2.9f * sinf(b), 0.62f);
         add_tube(s, v(p.x, p.y, 0), v(p.x, p.y, 0.7f), 0.06f, 0.045f, 12, METAL, seed, here);
@@ -791,7 +791,7 @@ static void build_kitchen(world* s) {
     add_room(s, &r, windows, counts);
     const opening splash[3][1] = {
         {{0.05f, 1.5f, 0.9f, 1.45f}}, {{1.5f, 2.9f, 0.9f, 1.1f}}, {{2.9f, 4.35f, 0.9f, 1.45f}}};
-    for (int i = 0; i < 3; i++)  // tiles
+    for (int i = 0; i < 3; i++) // tiles
         add_sheet(s, v(splash[i][0].x0, -0.01f, 0.9f), v(splash[i][0].x1 - splash[i][0].x0, 0, 0),
                   v(0, 0, splash[i][0].z1 - 0.9f), 0.1f, TILES, seed * 5u + 17u, wall);
     add_block(s, v(0, -0.62f, 0.08f), v(4.4f, 0, 0.86f), 0.3f, ENAMEL, seed, wall);
@@ -809,7 +809,7 @@ static void build_kitchen(world* s) {
             add_panel(s, v(x, -0.625f, 0.47f), v(1, 0, 0), v(0, 0, 1), 0.56f, 0.72f, DOOR, seed + 64u, wall);
         }
     }
-    for (int i = 0; i < 2; i++) {  // shelves left and right of the window
+    for (int i = 0; i < 2; i++) { // shelves left and right of the window
         const float x0 = i ? 2.98f : 0.1f, x1 = i ? 4.3f : 1.42f;
         for (int k = 0; k < 2; k++) {
             const float z = 1.56f + 0.38f * (float)k;
@@ -818,7 +818,7 @@ static void build_kitchen(world* s) {
                 add_trinket(s, draw(s, 0.18f, 0.26f), within(wall, x, -0.13f, z + 0.026f, draw(s, -0.6f, 0.6f)));
         }
         add_tube(s, v(x0, -0.05f, 1.42f), v(x1, -0.05f, 1.42f), 0.008f, 0.008f, 7, CHROME, 1, wall);
-        for (int k = 0; k < 5; k++) {  // ladles and pans on hooks
+        for (int k = 0; k < 5; k++) { // ladles and pans on hooks
             const float x = x0 + 0.16f + 0.25f * (float)k, l = draw(s, 0.2f, 0.28f);
             add_tube(s, v(x, -0.07f, 1.42f), v(x, -0.07f, 1.42f - l), 0.006f, 0.006f, 6, CHROME, 1, wall);
             if (k % 2)
@@ -826,14 +826,14 @@ static void build_kitchen(world* s) {
             else add_cushion(s, v(0.035f, 0.03f, 0.035f), 1.0f, CHROME, seed, within(wall, x, -0.07f, 1.40f - l, 0));
         }
     }
-    add_block(s, v(3.1f, -0.58f, 0.90f), v(3.75f, -0.08f, 0.92f), 0.1f, METAL, 5, wall);  // stove with pots
+    add_block(s, v(3.1f, -0.58f, 0.90f), v(3.75f, -0.08f, 0.92f), 0.1f, METAL, 5, wall); // stove with pots
     for (int i = 0; i < 2; i++) {
         const place pot = within(wall, 3.25f + 0.33f * (float)i, -0.33f, 0.92f, 0.8f * (float)i);
         add_tube(s, v(0, 0, 0), v(0, 0, 0.15f), 0.125f, 0.13f, 32, i ? ENAMEL : CHROME, seed, pot);
         add_lathe(s, profiles[7], 0.13f, 0.05f, 28, 12, i ? ENAMEL : CHROME, seed, within(pot, 0, 0, 0.15f, 0));
         add_tube(s, v(0.12f, 0, 0.12f), v(0.30f, 0, 0.13f), 0.012f, 0.012f, 8, METAL, 1, pot);
     }
-    add_block(s, v(1.85f, -0.55f, 0.895f), v(2.5f, -0.12f, 0.905f), 0.1f, CHROME, 1, wall);  // sink
+    add_block(s, v(1.85f, -0.55f, 0.895f), v(2.5f, -0.12f, 0.905f), 0.1f, CHROME, 1, wall); // sink
     add_tube(s, v(2.17f, -0.08f, 0.9f), v(2.17f, -0.08f, 1.18f), 0.016f, 0.014f, 10, CHROME, 1, wall);
     add_tube(s, v(2.17f, -0.08f, 1.18f), v(2.17f, -0.28f, 1.14f), 0.014f, 0.012f, 10, CHROME, 1, wall);
     scatter(s, 5, 1.5f, 0.5f, 0.22f, within(wall, 0.9f, -0.33f, 0.9f, 0));
@@ -877,7 +877,7 @@ static void build_gallery(world* s) {
         }
         add_tube(s, v(0, -0.03f, 3.1f), v(length, -0.03f, 3.1f), 0.012f, 0.012f, 6, METAL, 1, wall);
     }
-    for (int i = 0; i < 6; i++) {  // sculptures on plinths on both sides of the way
+    for (int i = 0; i < 6; i++) { // sculptures on plinths on both sides of the way
         const float x = (i & 1 ? 1.0f : -1.0f) * (r.x - 1.15f), y = -3.6f + 1.5f * (float)i, top = draw(s, 0.7f, 1.05f);
         const place at = place_at(x, y, 0, draw(s, 0, 3));
         const material stone = stones[draw_int(s, 4)];
@@ -907,7 +907,7 @@ static void build_gallery(world* s) {
                     add_ball(s, (0.24f - 0.05f * (float)k) * size, k & 1 ? CHROME : ENAMEL, seed + (uint32_t)k,
                              within(at, 0, 0, top + size * (0.24f + 0.4f * (float)k - 0.045f * (float)(k * k)), 0));
         }
-        for (int k = 0; k < 2; k++) {  // a rope in front
+        for (int k = 0; k < 2; k++) { // a rope in front
             const float px = (i & 1 ? -0.55f : 0.55f), py = (k ? 0.45f : -0.45f);
             add_tube(s, v(x + px, y + py, 0), v(x + px, y + py, 0.8f), 0.016f, 0.016f, 8, CHROME, 1,
                      place_at(0, 0, 0, 0));
@@ -917,7 +917,7 @@ static void build_gallery(world* s) {
                           place_at(0, 0, 0, 0));
         }
     }
-    for (int i = 0; i < 4; i++) {  // skylights
+    for (int i = 0; i < 4; i++) { // skylights
         const float y = -4.8f + 3.2f * (float)i;
         add_block(s, v(-0.9f, y - 0.7f, r.height - 0.03f), v(0.9f, y + 0.7f, r.height), 0.2f, GLOW, 3,
                   place_at(0, 0, 0, 0));
@@ -936,7 +936,7 @@ static void build_market(world* s) {
     const float half = draw(s, 1.7f, 2.1f);
     set_daylight(s, -1.4f, 0.9f);
     add_outdoors(s, 10.0f, seed & 1u ? PAVING : CONCRETE, seed);
-    for (int i = 0; i < 4; i++) {  // posts, and an awning over the stall
+    for (int i = 0; i < 4; i++) { // posts, and an awning over the stall
         const float x = i & 1 ? half : -half, y = i & 2 ? 0.9f : -0.75f;
         add_tube(s, v(x, y, 0), v(x, y, i & 2 ? 2.75f : 2.25f), 0.03f, 0.03f, 8, WOOD, seed | 256u, here);
     }
@@ -945,7 +945,7 @@ static void build_market(world* s) {
               here);
     add_sheet(s, v(-half - 0.25f, -1.105f, 1.96f), v(2 * half + 0.5f, 0, 0), v(0, 0, 0.2f), 0.12f, FABRIC, stripes,
               here);
-    for (int row = 0; row < 3; row++) {  // crates on steps
+    for (int row = 0; row < 3; row++) { // crates on steps
         const float z = 0.55f + 0.24f * (float)row, y = -0.45f + 0.43f * (float)row;
         add_block(s, v(-half + 0.05f, y - 0.21f, z - 0.04f), v(half - 0.05f, y + 0.21f, z), 0.2f, WOOD, seed, here);
         add_block(s, v(-half + 0.05f, y + 0.19f, 0), v(half - 0.05f, y + 0.21f, z), 0.3f, WOOD, seed, here);
@@ -956,7 +956,7 @@ static void build_market(world* s) {
             else
                 for (int k = 0; k < 2; k++)
                     add_trinket(s, draw(s, 0.22f, 0.32f), within(at, -0.13f + 0.28f * (float)k, 0, 0, draw(s, -1, 1)));
-            if (draw(s, 0, 1) < 0.5f) {  // price
+            if (draw(s, 0, 1) < 0.5f) { // price
                 add_tube(s, v(0, -0.17f, 0.1f), v(0, -0.17f, 0.3f), 0.004f, 0.004f, 4, WOOD, 1, at);
                 add_panel(s, v(0, -0.176f, 0.33f), v(1, 0, 0), v(0, 0, 1), 0.17f, 0.11f, CHALK, draw_seed(s), at);
             }
@@ -1013,4 +1013,4 @@ static const layout layouts[] = {
 };
 enum { LAYOUTS = sizeof layouts / sizeof *layouts };
 
-#endif  // SCENE_LAYOUTS_H
+#endif // SCENE_LAYOUTS_H

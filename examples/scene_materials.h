@@ -69,7 +69,7 @@ typedef struct surface { material m; uint32_t seed; float yaw, aspect; } surface
 typedef struct look {
     v3 albedo;    // linear
     float height; // of the relief in metres, for bump mapping
-    float gloss;  // 0 matt .. 1 glazed
+    float gloss; // 0 matt .. 1 glazed
     float mirror; // reflectance of a mirror
     v3 glow;      // emitted light
 } look;
@@ -194,7 +194,7 @@ static look look_ball(v3 p, float radius, float w) {
     l.albedo = fabsf(q.z) > 0.93f * radius ? colors[1] : colors[sector];
     l.albedo = mul(l.albedo, 0.7f + 0.45f * fbm(mul(p, 25.0f), 4, 25.0f * w));
     if (fbm(add(mul(p, 11.0f), v(3, 8, 1)), 4, 11.0f * w) > 0.63f)
-        l.albedo = mix(l.albedo, v(0.25f, 0.19f, 0.13f), 0.6f);  // dirt
+        l.albedo = mix(l.albedo, v(0.25f, 0.19f, 0.13f), 0.6f); // dirt
     return l;
 }
 
@@ -588,7 +588,7 @@ static v3 picture_at(float x, float y, float a, uint32_t seed, float w) { // lan
 }
 
 static v3 small_print(float x, float y, float line, v3 paper, v3 ink, uint32_t seed,
-                      float w) {  // lines of text too small to read
+                      float w) { // lines of text too small to read
     const int32_t row = floor_int(y / line);
     const float within = y / line - (float)row, word = x / (0.9f * line);
     const int32_t at = floor_int(word);
@@ -800,7 +800,7 @@ static look look_at(const surface* what, v3 p, v3 n, float w) {
             const float grain = fbm(mul(p, 38.0f), 3, 38.0f * w), big = fbm(mul(p, 9.0f), 3, 9.0f * w);
             l.albedo = mul(mix(v(0.22f, 0.21f, 0.20f), v(0.62f, 0.58f, 0.53f), big), 0.45f + 1.0f * grain);
             if (fbm(add(mul(p, 6.0f), v(9, 9, 9)), 4, 6.0f * w) > 0.58f)
-                l.albedo = mix(l.albedo, v(0.30f, 0.31f, 0.08f), 0.7f);  // lichen
+                l.albedo = mix(l.albedo, v(0.30f, 0.31f, 0.08f), 0.7f); // lichen
             l.height = 0.01f * big + 0.004f * grain;
             return l;
         }

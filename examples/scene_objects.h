@@ -9,7 +9,7 @@
 // One stream per scene, in the order in which it is built.
 
 static float draw(world* s, float lo, float hi) { return pick(s, 60, s->draws++, lo, hi); }
-static int draw_int(world* s, int count) {  // 0 .. count-1
+static int draw_int(world* s, int count) { // 0 .. count-1
     const int i = (int)draw(s, 0.0f, (float)count);
     return i < count ? i : count - 1;
 }
@@ -70,24 +70,24 @@ static void hang_panel(world* s, v3 center, float yaw, float width, float height
 
 // ---- round shapes ----------------------------------------------------------------
 
-static v3 patch_tube(float u, float w, const float* s) {  // ends, radii, sag
+static v3 patch_tube(float u, float w, const float* s) { // ends, radii, sag
     const v3 a = v(s[0], s[1], s[2]), axis = v(s[3] - s[0], s[4] - s[1], s[5] - s[2]), d = unit(axis);
     const v3 t = unit(fabsf(d.z) < 0.8f ? cross(d, v(0, 0, 1)) : cross(d, v(1, 0, 0))), b = cross(d, t);
     const float angle = 6.2831853f * u, r = s[6] + w * (s[7] - s[6]);
     const v3 p = add(add(a, mul(axis, w)), add(mul(t, r * cosf(angle)), mul(b, r * sinf(angle))));
     return v(p.x, p.y, p.z - 4.0f * s[8] * w * (1.0f - w));
 }
-static v3 patch_disc(float u, float w, const float* s) {  // radius, height; faces up
+static v3 patch_disc(float u, float w, const float* s) { // radius, height; faces up
     const float a = 6.2831853f * u, r = s[0] * (1.0f - w);
     return v(cosf(a) * r, sinf(a) * r, s[1]);
 }
 static float bent(float x, float power) { return (x < 0 ? -1.0f : 1.0f) * powf(fabsf(x), power); }
-static v3 patch_cushion(float u, float w, const float* s) {  // half axes, roundness (1: an ellipsoid, 0: a box)
+static v3 patch_cushion(float u, float w, const float* s) { // half axes, roundness (1: an ellipsoid, 0: a box)
     const float a = 6.2831853f * u, b = 3.1415927f * (w - 0.5f), e = s[3];
     return v(s[0] * bent(cosf(a), e) * bent(cosf(b), e), s[1] * bent(sinf(a), e) * bent(cosf(b), e),
              s[2] * bent(sinf(b), e));
 }
-static v3 patch_knot(float u, float w, const float* s) {  // radius of the whole, of the tube; p, q
+static v3 patch_knot(float u, float w, const float* s) { // radius of the whole, of the tube; p, q
     const float t = 6.2831853f * w, e = 1e-3f;
     v3 at[2];
     for (int i = 0; i < 2; i++) {
@@ -96,9 +96,9 @@ static v3 patch_knot(float u, float w, const float* s) {  // radius of the whole
     }
     const v3 d = unit(sub(at[1], at[0])), side = unit(cross(d, v(at[0].x, at[0].y, 0.3f * s[0]))), b = cross(d, side);
     const v3 p = add(at[0], sub(mul(side, s[1] * cosf(6.2831853f * u)), mul(b, s[1] * sinf(6.2831853f * u))));
-    return v(p.x, p.z, p.y + 1.05f * s[0]);  // upright
+    return v(p.x, p.z, p.y + 1.05f * s[0]); // upright
 }
-static v3 patch_drape(float u, float w, const float* s) {  // a curtain: width, height, depth of the folds, their number
+static v3 patch_drape(float u, float w, const float* s) { // a curtain: width, height, depth of the folds, their number
     const float fold = sinf(6.2831853f * s[3] * u + 1.3f * sinf(9.0f * u)) * s[2] * (0.5f + 0.5f * (1 - w));
     return v(s[0] * (u - 0.5f), -fold, s[1] * w);
 }
@@ -112,7 +112,7 @@ static void add_cable(world* s, v3 a, v3 b, float r, float sag, material m, plac
     const float shape[9] = {a.x, a.y, a.z, b.x, b.y, b.z, r, r, sag};
     add_patch(s, patch_tube, shape, 5, 24, m, 1, where);
 }
-static void add_ball(world* s, float radius, material m, uint32_t seed, place where) {  // around the place
+static void add_ball(world* s, float radius, material m, uint32_t seed, place where) { // around the place
     const float shape[4] = {radius, 1, 0, 0};
     add_patch(s, patch_sphere, shape, 28, 18, m, seed, where);
 }
@@ -141,16 +141,16 @@ static void add_lathe(world* s, const float* profile, float radius, float height
 }
 
 static const float profiles[8][20] = {
-    {9, 0, 0, 0.5f, 0, 0.55f, 0.1f, 0.9f, 0.4f, 1, 0.7f, 0.75f, 1.1f, 0.35f, 1.4f, 0.4f, 1.6f, 0.55f, 1.7f},  // vase
-    {8, 0, 0, 0.95f, 0, 1, 0.06f, 1, 0.6f, 1, 1.2f, 0.35f, 1.5f, 0.3f, 1.8f, 0.32f, 1.95f},                   // bottle
-    {7, 0, 0, 0.4f, 0, 0.45f, 0.08f, 0.9f, 0.4f, 1.0f, 0.75f, 0.97f, 0.75f, 0.5f, 0.25f},                     // bowl
-    {8, 0, 0, 0.8f, 0, 0.82f, 0.05f, 0.95f, 0.5f, 1, 1, 0.97f, 1.02f, 0.9f, 1.0f, 0.7f, 0.2f},                // cup
+    {9, 0, 0, 0.5f, 0, 0.55f, 0.1f, 0.9f, 0.4f, 1, 0.7f, 0.75f, 1.1f, 0.35f, 1.4f, 0.4f, 1.6f, 0.55f, 1.7f}, // vase
+    {8, 0, 0, 0.95f, 0, 1, 0.06f, 1, 0.6f, 1, 1.2f, 0.35f, 1.5f, 0.3f, 1.8f, 0.32f, 1.95f},                  // bottle
+    {7, 0, 0, 0.4f, 0, 0.45f, 0.08f, 0.9f, 0.4f, 1.0f, 0.75f, 0.97f, 0.75f, 0.5f, 0.25f},                    // bowl
+    {8, 0, 0, 0.8f, 0, 0.82f, 0.05f, 0.95f, 0.5f, 1, 1, 0.97f, 1.02f, 0.9f, 1.0f, 0.7f, 0.2f},               // cup
     {9, 0, 0, 0.6f, 0, 0.65f, 0.1f, 1, 0.6f, 1, 0.95f, 0.6f, 1.25f, 0.65f, 1.3f, 0.1f, 1.45f, 0.12f,
-     1.6f},  // jar with a lid
+     1.6f}, // jar with a lid
     {9, 0, 0, 1, 0, 0.9f, 0.08f, 0.25f, 0.2f, 0.18f, 0.9f, 0.3f, 1.0f, 0.16f, 1.1f, 0.4f, 1.75f, 0.3f,
-     1.8f},                                                                                              // candlestick
-    {8, 0, 0, 0.7f, 0, 0.78f, 0.2f, 0.95f, 0.85f, 1.05f, 0.95f, 1.05f, 1.1f, 0.9f, 1.08f, 0.86f, 0.9f},  // flower pot
-    {8, 0, 0, 0.3f, 0.05f, 0.95f, 0.5f, 1, 0.9f, 0.85f, 1.25f, 0.45f, 1.5f, 0.2f, 1.7f, 0.0f, 1.75f}};   // pear, pawn
+     1.8f},                                                                                             // candlestick
+    {8, 0, 0, 0.7f, 0, 0.78f, 0.2f, 0.95f, 0.85f, 1.05f, 0.95f, 1.05f, 1.1f, 0.9f, 1.08f, 0.86f, 0.9f}, // flower pot
+    {8, 0, 0, 0.3f, 0.05f, 0.95f, 0.5f, 1, 0.9f, 0.85f, 1.25f, 0.45f, 1.5f, 0.2f, 1.7f, 0.0f, 1.75f}};  // pear, pawn
 
 // ---- plants ----------------------------------------------------------------------
 
@@ -185,13 +185,13 @@ static void add_potted_plant(world* s, float size, place where) {
     add_lathe(s, profiles[6], 0.19f * size, 0.32f * size, 28, 16, draw(s, 0, 1) < 0.5f ? TERRACOTTA : GLASSY,
               draw_seed(s), where);
     add_disc(s, 0.16f * size, 0.27f * size, SOIL, 0, where);
-    if (kind == 0) {  // blades
+    if (kind == 0) { // blades
         for (int i = 0; i < 46; i++) {
             const v3 d = unit(add(draw_direction(s, 0.2f), v(0, 0, 0.8f)));
             add_leaf(s, v(0.05f * d.x, 0.05f * d.y, 0.27f * size), d, draw(s, 0.4f, 0.85f) * size, 0.06f * size,
                      FOLIAGE, species << 16 | (uint32_t)i, where);
         }
-    } else {  // a bush, sometimes on a stem
+    } else { // a bush, sometimes on a stem
         const float up = kind == 1 ? 0.52f : 0.95f;
         add_tube(s, v(0, 0, 0.2f * size), v(0, 0, up * size), 0.02f * size, 0.012f * size, 7, BARK, species, where);
         add_crown(s, mul(v(0.30f, 0.30f, 0.30f), size), 240, 0.13f * size, species, draw(s, -0.3f, 0.35f),
@@ -218,14 +218,14 @@ static void add_tree(world* s, float height, int leaves, place where) {
               within(where, lean * trunk, 0, 0.86f * height, 0));
 }
 
-static void add_hedge(world* s, float length, float depth, float height, place where) {  // along x
+static void add_hedge(world* s, float length, float depth, float height, place where) { // along x
     const uint32_t species = draw_seed(s);
     const int leaves = (int)(380.0f * length * height);
     add_block(s, v(-0.5f * length, -0.4f * depth, 0), v(0.5f * length, 0.4f * depth, 0.95f * height), 0.3f, LEAVES,
               species << 16, where);
     for (int i = 0; i < leaves; i++) {
         const float x = draw(s, -0.5f, 0.5f) * length, z = draw(s, 0.0f, height);
-        const int face = draw_int(s, 5);  // front, front, back, back, top
+        const int face = draw_int(s, 5); // front, front, back, back, top
         const v3 base = face == 4 ? v(x, draw(s, -0.45f, 0.45f) * depth, 0.93f * height)
                                   : v(x, (face < 2 ? -0.4f : 0.4f) * depth, z);
         const v3 out = face == 4 ? v(0, 0, 1) : v(0, face < 2 ? -1.0f : 1.0f, 0.2f);
@@ -234,7 +234,7 @@ static void add_hedge(world* s, float length, float depth, float height, place w
     }
 }
 
-static void add_flowers(world* s, float length, float depth, int count, place where) {  // a bed along x
+static void add_flowers(world* s, float length, float depth, int count, place where) { // a bed along x
     const uint32_t species = draw_seed(s);
     add_sheet(s, v(-0.5f * length, -0.5f * depth, 0.02f), v(length, 0, 0), v(0, depth, 0), 0.2f, SOIL, 0, where);
     for (int i = 0; i < count; i++) {
@@ -270,7 +270,7 @@ static void add_table(world* s, float length, float depth, float height, uint32_
     }
 }
 
-static void add_chair(world* s, uint32_t seed, place where) {  // faces +y, seat at 0.45
+static void add_chair(world* s, uint32_t seed, place where) { // faces +y, seat at 0.45
     const int slats = 3 + (int)(seed % 4u);
     add_block(s, v(-0.21f, -0.21f, 0.42f), v(0.21f, 0.21f, 0.455f), 0.1f, WOOD, seed, where);
     for (int i = 0; i < 4; i++) {
@@ -289,7 +289,7 @@ static void add_chair(world* s, uint32_t seed, place where) {  // faces +y, seat
     if (seed & 64u) add_cushion(s, v(0.19f, 0.19f, 0.03f), 0.45f, FABRIC, seed, within(where, 0, 0, 0.485f, 0));
 }
 
-static void add_sofa(world* s, float length, uint32_t seed, place where) {  // faces +y
+static void add_sofa(world* s, float length, uint32_t seed, place where) { // faces +y
     const float half = 0.5f * length;
     add_cushion(s, v(half, 0.40f, 0.14f), 0.18f, FABRIC, seed, within(where, 0, 0.02f, 0.22f, 0));
     add_cushion(s, v(half, 0.11f, 0.34f), 0.22f, FABRIC, seed, within(where, 0, -0.34f, 0.52f, 0));
@@ -306,7 +306,7 @@ static void add_sofa(world* s, float length, uint32_t seed, place where) {  // f
     }
 }
 
-static void add_book(world* s, float thick, float depth, float height, place where) {  // stands, spine towards -y
+static void add_book(world* s, float thick, float depth, float height, place where) { // stands, spine towards -y
     const uint32_t seed = draw_seed(s);
     add_block(s, v(0, 0, 0), v(thick, depth, height), 0.5f, ENAMEL, seed, where);
     add_block(s, v(0.1f * thick, 0.01f, 0.01f), v(0.9f * thick, depth - 0.005f, height + 0.001f), 0.5f, PAGES, seed,
@@ -314,7 +314,7 @@ static void add_book(world* s, float thick, float depth, float height, place whe
     add_panel(s, v(0.5f * thick, -0.0015f, 0.5f * height), v(1, 0, 0), v(0, 0, 1), thick, height, SPINE, seed, where);
 }
 
-static void add_books(world* s, float length, float depth, float highest_book, place where) {  // a row along x
+static void add_books(world* s, float length, float depth, float highest_book, place where) { // a row along x
     for (float x = 0.0f; x < length;) {
         const float thick = draw(s, 0.018f, 0.055f), height = highest_book * draw(s, 0.66f, 0.97f);
         if (x + thick > length) return;
@@ -323,7 +323,7 @@ static void add_books(world* s, float length, float depth, float highest_book, p
     }
 }
 
-static void add_cube(world* s, float size, uint32_t seed, place where) {  // a toy block with signs
+static void add_cube(world* s, float size, uint32_t seed, place where) { // a toy block with signs
     add_block(s, v(-0.5f * size, -0.5f * size, 0), v(0.5f * size, 0.5f * size, size), 0.1f, ENAMEL, seed, where);
     for (int i = 0; i < 4; i++)
         hang_panel(
@@ -339,7 +339,7 @@ static void add_trinket(world* s, float size, place where) {
         case 1:
             add_lathe(s, profiles[1], 0.2f * size, size, 24, 24, draw(s, 0, 1) < 0.6f ? LABEL : CHROME, seed, where);
             return;
-        case 2: {  // bowl of fruit
+        case 2: { // bowl of fruit
             add_lathe(s, profiles[2], 0.6f * size, 0.42f * size, 36, 28, draw(s, 0, 1) < 0.7f ? GLASSY : WOOD, seed,
                       where);
             const float apple[1] = {0.2f * size}, orange[4] = {0.2f * size, 0.95f, 0.02f, 1};
@@ -351,7 +351,7 @@ static void add_trinket(world* s, float size, place where) {
             }
             return;
         }
-        case 3: {  // cup with a handle
+        case 3: { // cup with a handle
             const float ring[2] = {0.24f * size, 0.05f * size};
             add_lathe(s, profiles[3], 0.38f * size, 0.75f * size, 32, 24, GLASSY, seed, where);
             add_patch(s, patch_knot, (const float[4]){ring[0], ring[1], 1, 0}, 10, 24, GLASSY, seed,
@@ -367,15 +367,15 @@ static void add_trinket(world* s, float size, place where) {
             add_tube(s, v(0, 0, 0.78f * size), v(0, 0, 1.15f * size), 0.05f * size, 0.045f * size, 14, PAGES, seed,
                      where);
             return;
-        case 6:  // tin
+        case 6: // tin
             add_tube(s, v(0, 0, 0), v(0, 0, 0.75f * size), 0.3f * size, 0.3f * size, 32, LABEL, seed, where);
             add_disc(s, 0.3f * size, 0.75f * size, CHROME, seed, where);
             return;
-        case 7: {  // a ball
+        case 7: { // a ball
             add_ball(s, 0.4f * size, FABRIC, seed, within(where, 0, 0, 0.4f * size, 0));
             return;
         }
-        case 8:  // blocks
+        case 8: // blocks
             add_cube(s, 0.42f * size, seed, where);
             add_cube(s, 0.38f * size, seed + 9u, within(where, 0.05f * size, 0.02f * size, 0.425f * size, 0.5f));
             add_cube(s, 0.34f * size, seed + 17u, within(where, 0.47f * size, -0.1f * size, 0, 0.9f));
@@ -384,7 +384,7 @@ static void add_trinket(world* s, float size, place where) {
             add_patch(s, patch_knot, (const float[4]){0.42f * size, 0.11f * size, 2, 3}, 14, 110,
                       draw(s, 0, 1) < 0.5f ? METAL : MARBLE, seed, where);
             return;
-        case 10:  // lying books
+        case 10: // lying books
             for (int i = 0; i < 4; i++) {
                 const float z = 0.2f * size * (float)i, w = 0.42f * size - 0.03f * size * (float)i;
                 const place at = within(where, 0, 0, z, draw(s, -0.5f, 0.5f));
@@ -397,14 +397,14 @@ static void add_trinket(world* s, float size, place where) {
                           seed + 7u * (uint32_t)i, at);
             }
             return;
-        case 11: {  // a globe on a stand
+        case 11: { // a globe on a stand
             add_lathe(s, profiles[5], 0.24f * size, 0.4f * size, 20, 20, WOOD, seed, where);
             add_ball(s, 0.34f * size, BALL, seed, within(where, 0, 0, 0.68f * size, 0));
             add_patch(s, patch_knot, (const float[4]){0.38f * size, 0.012f * size, 1, 0}, 6, 40, CHROME, seed,
                       within(where, 0, 0, 0.68f * size - 1.05f * 0.38f * size, 0.4f));
             return;
         }
-        case 12:  // a framed picture that leans back
+        case 12: // a framed picture that leans back
             add_panel(s, v(0, 0, 0.46f * size), v(1, 0, 0), unit(v(0, 0.2f, 1)), 0.74f * size, 0.92f * size, PICTURE,
                       seed, where);
             add_block(s, v(-0.3f * size, 0.02f * size, 0), v(0.3f * size, 0.11f * size, 0.1f * size), 0.2f, WOOD, seed,
@@ -428,7 +428,7 @@ static void add_standing_lamp(world* s, float height, float power, place where) 
     add_lamp_bulb(s, top, mul(v(1.0f, 0.74f, 0.46f), power), 0.26f);
 }
 
-static void add_pendant(world* s, v3 at, float ceiling, float power) {  // hangs from the ceiling
+static void add_pendant(world* s, v3 at, float ceiling, float power) { // hangs from the ceiling
     const place where = {at, 0};
     static const float bell[] = {5, 0.1f, 0.22f, 0.5f, 0.2f, 0.8f, 0.1f, 1.0f, 0.0f, 0.98f, 0.0f};
     add_tube(s, v(0, 0, 0.2f), v(0, 0, ceiling - at.z), 0.006f, 0.006f, 5, METAL, 1, where);
@@ -454,7 +454,7 @@ static void add_railing(world* s, float length, float height, float step, float 
 }
 
 static void add_pickets(world* s, float length, float height, uint32_t seed,
-                        place where) {  // a fence of boards along x
+                        place where) { // a fence of boards along x
     const int count = (int)(length / 0.13f);
     for (int i = 0; i < count; i++) {
         const float x = 0.13f * (float)i, top = height * (1.0f + 0.04f * sinf(2.1f * (float)i));
@@ -467,7 +467,7 @@ static void add_pickets(world* s, float length, float height, uint32_t seed,
     }
 }
 
-static void add_wheel(world* s, float radius, place where) {  // in the plane of x and z
+static void add_wheel(world* s, float radius, place where) { // in the plane of x and z
     add_patch(s, patch_knot, (const float[4]){radius, 0.018f, 1, 0}, 8, 48, METAL, 2,
               within(where, 0, 0, -0.05f * radius, 0));
     for (int i = 0; i < 14; i++) {
@@ -478,7 +478,7 @@ static void add_wheel(world* s, float radius, place where) {  // in the plane of
     add_ball(s, 0.03f, CHROME, 1, within(where, 0, 0, radius, 0));
 }
 
-static void add_bicycle(world* s, place where) {  // along x
+static void add_bicycle(world* s, place where) { // along x
     const uint32_t seed = draw_seed(s);
     const v3 rear = v(-0.52f, 0, 0.33f), front = v(0.52f, 0, 0.33f), crank = v(-0.08f, 0, 0.30f),
              seat = v(-0.22f, 0, 0.80f), head = v(0.36f, 0, 0.82f);
@@ -499,7 +499,7 @@ static void add_bicycle(world* s, place where) {  // along x
                  METAL, 1, where);
 }
 
-static void add_bench(world* s, uint32_t seed, place where) {  // faces +y
+static void add_bench(world* s, uint32_t seed, place where) { // faces +y
     for (int i = 0; i < 4; i++)
         add_block(s, v(-0.8f, -0.2f + 0.12f * (float)i, 0.42f), v(0.8f, -0.11f + 0.12f * (float)i, 0.45f), 0.2f, WOOD,
                   seed, where);
@@ -526,7 +526,7 @@ static void add_street_lamp(world* s, float height, place where) {
     add_lathe(s, profiles[7], 0.07f, 0.2f, 14, 12, METAL, seed, within(where, 0, 0, height, 0));
 }
 
-static void add_crate(world* s, float x, float y, float z, place where) {  // of slats, open above
+static void add_crate(world* s, float x, float y, float z, place where) { // of slats, open above
     const uint32_t seed = draw_seed(s);
     const float t = 0.012f;
     for (int i = 0; i < 3; i++) {
@@ -557,4 +557,4 @@ static void add_fruit_crate(world* s, place where) {
         }
 }
 
-#endif  // SCENE_OBJECTS_H
+#endif // SCENE_OBJECTS_H

@@ -12,7 +12,7 @@ typedef struct photo_job {
     uint8_t* pixels; // (height,width,3)
     float* depth;    // (height,width)
     float* normal;   // (height,width,3)
-    float exposure;  // factor
+    float exposure; // factor
 } photo_job;
 
 // Between -drift/2 and drift/2 stops, about 17 photos per period.
@@ -26,7 +26,7 @@ static v3 eye_of(const gsf_camera* camera) {
     return v((float)c[0], (float)c[1], (float)c[2]);
 }
 static v3 ray_through(const gsf_camera* camera, double x, double y,
-                      float* z) {  // z: camera depth per unit of ray length
+                      float* z) { // z: camera depth per unit of ray length
     const double *m = camera->w2c, a = (x - camera->cx) / camera->fx, b = (y - camera->cy) / camera->fy;
     const v3 d = v((float)(m[0] * a + m[1] * b + m[2]), (float)(m[4] * a + m[5] * b + m[6]),
                    (float)(m[8] * a + m[9] * b + m[10]));
@@ -65,7 +65,7 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
             v3 c = sky(job->s, d);
             if (trace(job->s, eye, d, 0.01f, &h)) {
                 const float r1 =
-                    ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES;  // one sample per ring of the sun's disc
+                    ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES; // one sample per ring of the sun's disc
                 c = shade(job->s, &h, d, r1, random3((int32_t)pixel, 2, (int32_t)job->view) + 0.381966f * (float)k, 0);
                 c = mix(c, job->s->air.haze, minf(job->s->air.haze_density * h.t, 1.0f));
             }

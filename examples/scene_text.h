@@ -51,4 +51,4 @@ static float ink_in_box(const char* word, float x, float y, float box_width, flo
     return ink_of(word, x / scale + 0.5f * length_of(word), y / scale + 1.0f, weight, width / scale);
 }
 
-#endif  // SCENE_TEXT_H
+#endif // SCENE_TEXT_H
