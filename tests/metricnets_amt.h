@@ -141,6 +141,12 @@ static void amt_check_clip(gsf_context* ctx, const test_tensors* io, const char*
     }
     CHECK(metric.count == (int64_t)frames.dim[0]);
     golden_near(key, metric.score, score, 1e-6);
+    if (frames.dim[0] % 2) {
+        gsf_image three[3];
+        for (size_t i = 0; i < 3; i++) three[i] = golden_image(&frames, i);
+        golden_fail_memory(metric.kind, models, NULL, three, 3, 7);
+        for (int i = 0; i < 3; i++) free(three[i].data);
+    }
     uint8_t small[48 * 48 * 3] = {0};
     const gsf_image other = gsf_wrap_image(small, GSF_U8, 48, 48, 3);
     CHECK_RESULT(ctx, gsf_nn_measure_frame(ctx, &metric, &other, NULL), GSF_ERROR_INVALID_ARGUMENT);

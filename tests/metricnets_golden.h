@@ -3,6 +3,7 @@
 #define METRICNETS_GOLDEN_H
 
 #include "test.h"
+#include "test_hooks.h"
 
 #if defined(__unix__) || defined(__APPLE__)
 #include <sys/stat.h>
@@ -81,6 +82,35 @@ static inline double golden_number(const golden_config* config, const char* a, c
     for (int i = 0; i < 3 && value && keys[i]; i++) value = gsf_find_json_member(&config->json, value, keys[i]);
     if (value && index >= 0) value = gsf_find_json_element(&config->json, value, (uint32_t)index);
     return CHECK(value && value->type == GSF_JSON_NUMBER) ? value->number : NAN;
+}
+
+// Opens a metric and measures `count` frames, with every `step`-th allocation failing in turn: the error is that one, and
+// nothing leaks.
+static inline void golden_fail_memory(gsf_nn_metric_kind kind, const char* models, const int32_t* heads,
+                                      const gsf_image* frames, int count, size_t step) {
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    size_t k = 1;
+    for (; result != GSF_OK && k < 2000; k += step) {
+        gsf_context ctx;
+        gsf_nn_metric metric;
+        counter c;
+        memset(&c, 0, sizeof c);
+        memset(&metric, 0, sizeof metric);
+        test_context_zero(&ctx);
+        count_memory(&ctx, &c);
+        CHECK_OK(&ctx, gsf_init_context(&ctx));
+        metric.kind = kind;
+        metric.models = models;
+        metric._heads = heads;
+        c.fail_at = k;
+        result = gsf_nn_measure_frame(&ctx, &metric, NULL, NULL);
+        for (int i = 0; i < count && result == GSF_OK; i++)
+            result = gsf_nn_measure_frame(&ctx, &metric, &frames[i], &frames[0]);
+        CHECK_RESULT(&ctx, result, c.calls < k ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY);
+        gsf_nn_destroy_metric(&ctx, &metric);
+        CHECK(c.live == 0);
+    }
+    CHECK(k > 20 && result == GSF_OK);
 }
 
 #endif

@@ -104,6 +104,7 @@ static void i2v_check_clip(gsf_context* ctx, const char* folder, const char* mod
     CHECK_RESULT(ctx, gsf_nn_measure_frame(ctx, &metric, &frame, NULL), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(metric.count == 0);
     gsf_nn_destroy_metric(ctx, &metric);
+    golden_fail_memory(kind, models, heads, &frame, 1, kind == GSF_NN_METRIC_I2V_SUBJECT ? 1 : 5);
     free(frame.data);
     free(reference.data);
     test_free_tensor(&frames);
