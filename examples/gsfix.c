@@ -1052,11 +1052,16 @@ static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_name
     int clips = 0;
     gsf_result result = GSF_OK;
     gsf_image input = {0}, frame = {0};
-    for (int m = 0; m < METRIC_COUNT; m++) clips += run->wanted[m] && metric_specs[m].clip;
+    for (int m = 0; m < METRIC_COUNT; m++) {
+        if (!run->wanted[m] || !metric_specs[m].clip) continue;
+        const size_t least = metric_specs[m].net == GSF_NN_METRIC_MOTION_SMOOTHNESS ? 3 : 2;
+        if (left->count < least)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has %zu pictures; %s needs at least %zu", app->o.inputs[0],
+                            left->count, metric_specs[m].name, least);
+        clips = 1;
+    }
     if (!clips) return GSF_OK;
-    if (left->count < 2 || !right->count)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has %s", app->o.inputs[left->count < 2 ? 0 : 1],
-                        left->count < 2 ? "fewer than two pictures: not a clip" : "no pictures");
+    if (!right->count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has no pictures", app->o.inputs[1]);
     result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[1], right->names[0]).s, 3, &input);
     for (size_t i = 0; i < left->count && result == GSF_OK; i++) {
         result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[0], left->names[i]).s, 3, &frame);
