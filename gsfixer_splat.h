@@ -1089,15 +1089,13 @@ static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_el
 
 // Called after the last property of `element`. Adds the size of elements that precede the vertices to *before, in bytes
 // (ASCII: words).
-static gsf_result gsf__ply_finish_element(gsf_context* ctx, gsf__ply* ply, const gsf__ply_element* element, int* found,
-                                          size_t* before) {
-    if (!element->seen || *found) return GSF_OK;
+static gsf_result gsf__ply_finish_element(gsf_context* ctx, gsf__ply* ply, const gsf__ply_element* element,
+                                          int has_vertex, size_t* before) {
     if (element->is_vertex) {
-        *found = 1;
         ply->columns = element->columns;
         ply->row_bytes = element->row_bytes;
-        return GSF_OK;
     }
+    if (!element->seen || has_vertex) return GSF_OK;
     if (element->has_list && element->rows)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: an element with lists precedes the vertices", ply->name);
     const size_t unit = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
@@ -1166,7 +1164,7 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
     memset(&element, 0, sizeof element);
     uint64_t vertices = 0;
     size_t before = 0;
-    int found = 0, has_format = 0, has_vertex = 0;
+    int has_format = 0, has_vertex = 0;
     for (size_t line = 0, number = 0;; number++) {
         const char* stop = line < size ? (const char*)memchr(text + line, '\n', size - line) : NULL;
         if (!stop && number == 0) stop = text + size; // so a short foreign file is "not a PLY file", not truncated
@@ -1182,7 +1180,7 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
             GSF__TRY(gsf__ply_read_format(ctx, ply, line, at, stop));
             has_format = 1;
         } else if (gsf__word_is(word, length, "element")) {
-            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, &found, &before));
+            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, has_vertex, &before));
             memset(&element, 0, sizeof element);
             element.seen = 1;
             size_t n = gsf__next_word(&at, stop, &word);
@@ -1197,7 +1195,7 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
         } else if (gsf__word_is(word, length, "property")) {
             GSF__TRY(gsf__ply_property(ctx, ply, &element, line, at, stop));
         } else if (gsf__word_is(word, length, "end_header")) {
-            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, &found, &before));
+            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, has_vertex, &before));
             ply->body = (size_t)(stop - text) + 1;
             break;
         } else if (!gsf__word_is(word, length, "comment") && !gsf__word_is(word, length, "obj_info") && length) {
@@ -1236,16 +1234,21 @@ static double gsf__ply_value(const unsigned char* p, gsf__ply_type type, int big
     return 0.0;
 }
 
-static double gsf__ply_cell(const gsf__ply* ply, size_t row, int slot) {
-    const unsigned char* p = ply->data + ply->body + row * ply->row_bytes + ply->offset[slot];
+static const unsigned char* gsf__ply_row(const gsf__ply* ply, size_t i) {
+    return ply->data + ply->body + i * ply->row_bytes;
+}
+
+static double gsf__ply_cell(const gsf__ply* ply, const unsigned char* row, int slot) {
     double value;
-    if (ply->format != GSF__PLY_ASCII) return gsf__ply_value(p, ply->type[slot], ply->format == GSF__PLY_BIG);
-    memcpy(&value, p, sizeof value);
+    if (ply->format != GSF__PLY_ASCII)
+        return gsf__ply_value(row + ply->offset[slot], ply->type[slot], ply->format == GSF__PLY_BIG);
+    memcpy(&value, row + ply->offset[slot], sizeof value);
     return value;
 }
 
 static void gsf__ply_position(const void* arg, size_t i, double* out) {
-    for (int k = 0; k < 3; k++) out[k] = gsf__ply_cell((const gsf__ply*)arg, i, k);
+    const gsf__ply* ply = (const gsf__ply*)arg;
+    for (int k = 0; k < 3; k++) out[k] = gsf__ply_cell(ply, gsf__ply_row(ply, i), k);
 }
 
 // Replaces the text of an ASCII file's rows by *values, which the caller frees even after an error. Binary: *values = NULL.
@@ -1367,7 +1370,7 @@ static void gsf__ply_list_targets(gsf__ply* ply, const gsf_splats* s) {
 
 // Decodes a row of little-endian float32 columns. Collects NaN and infinity in one bit to avoid a branch per value.
 static int gsf__ply_decode_f32(const gsf__ply* ply, size_t i) {
-    const unsigned char* row = ply->data + ply->body + i * ply->row_bytes;
+    const unsigned char* row = gsf__ply_row(ply, i);
     uint32_t bad = 0;
     for (size_t t = 0; t < ply->target_count; t++) {
         const gsf__ply_target* target = &ply->targets[t];
@@ -1381,10 +1384,11 @@ static int gsf__ply_decode_f32(const gsf__ply* ply, size_t i) {
 }
 
 static int gsf__ply_decode_any(const gsf__ply* ply, size_t i) {
+    const unsigned char* row = gsf__ply_row(ply, i);
     int bad = 0;
     for (size_t t = 0; t < ply->target_count; t++) {
         const gsf__ply_target* target = &ply->targets[t];
-        const float f = (float)gsf__ply_cell(ply, i, target->slot);
+        const float f = (float)gsf__ply_cell(ply, row, target->slot);
         bad |= gsf__float_is_bad(f);
         target->first[i * target->stride] = f;
     }
@@ -1510,13 +1514,6 @@ static unsigned char* gsf__put_f32(unsigned char* p, float value) {
     return p + 4;
 }
 
-static unsigned char* gsf__put_f64(unsigned char* p, double value) {
-    uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    gsf__store_le(p, bits, 8);
-    return p + 8;
-}
-
 static void gsf__ply_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__ply_write_job* job = (const gsf__ply_write_job*)arg;
     const gsf_splats* s = job->splats;
@@ -1528,7 +1525,8 @@ static void gsf__ply_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         const float* sh = s->sh + 3 * bands * i;
         for (size_t k = 0; k < 3; k++) {
             const double world = s->origin[k] + (double)s->means[3 * i + k];
-            p = job->wide ? gsf__put_f64(p, world) : gsf__put_f32(p, (float)world);
+            if (!job->wide) p = gsf__put_f32(p, (float)world);
+            else gsf__store_f64(p, world), p += 8;
         }
         for (int k = 0; k < 3; k++) p = gsf__put_f32(p, 0.0f); // normals
         for (int k = 0; k < 3; k++) p = gsf__put_f32(p, sh[k]);
@@ -1633,7 +1631,7 @@ typedef struct gsf__pack {
     const gsf_splats* splats;
     const char* name;
     size_t count;         // number of splats written
-    uint32_t* rows;       // their indices; NULL = all
+    uint32_t* rows;       // (splats->count) their indices, then unused
     uint8_t* bad;         // (splats->count) 1 where a value is NaN or infinite
     double farthest;      // largest |coordinate| of any position
     double typical;       // median scale
@@ -1665,6 +1663,11 @@ static float gsf__mean_log_scale(const gsf_splats* s, size_t i) {
     return (s->log_scales[3 * i] + s->log_scales[3 * i + 1] + s->log_scales[3 * i + 2]) / 3.0f;
 }
 
+static void gsf__pack_free(gsf_context* ctx, gsf__pack* job) {
+    gsf_free(ctx, job->rows);
+    gsf_free(ctx, job->bad);
+}
+
 static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf__pack* job) {
     double samples[1024];
     size_t n = 0;
@@ -1675,24 +1678,21 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SH degree %d is not 0..3", name, (int)splats->sh_degree);
     if (splats->count > UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, more than the format's 2^32", name, splats->count);
-    job->bad = (uint8_t*)gsf_alloc(ctx, splats->count ? splats->count : 1, 1);
-    if (!job->bad) return GSF_ERROR_OUT_OF_MEMORY;
+    job->bad = (uint8_t*)gsf_alloc(ctx, splats->count, 1);
+    job->rows = (uint32_t*)gsf_alloc(ctx, splats->count, sizeof *job->rows);
+    if (!job->bad || !job->rows) {
+        gsf__pack_free(ctx, job);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
     gsf__parallel_for(ctx, gsf__codec_chunks(splats->count), gsf__pack_check_chunk, job);
-    for (size_t i = 0; i < splats->count; i++) job->count += !job->bad[i];
-    if (job->count < splats->count) {
+    for (size_t i = 0; i < splats->count; i++)
+        if (!job->bad[i]) job->rows[job->count++] = (uint32_t)i;
+    if (job->count < splats->count)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats left out: a value is NaN, infinite or beyond float32", name,
                 splats->count - job->count, splats->count);
-        job->rows = (uint32_t*)gsf_alloc(ctx, job->count ? job->count : 1, sizeof *job->rows);
-        if (!job->rows) {
-            gsf_free(ctx, job->bad);
-            return GSF_ERROR_OUT_OF_MEMORY;
-        }
-        for (size_t i = 0, row = 0; i < splats->count; i++)
-            if (!job->bad[i]) job->rows[row++] = (uint32_t)i;
-    }
     const size_t stride = job->count / GSF__COUNT(samples) + 1;
     for (size_t row = 0; row < job->count; row++) {
-        const size_t i = job->rows ? job->rows[row] : row;
+        const size_t i = job->rows[row];
         for (size_t k = 0; k < 3; k++)
             job->farthest = fmax(job->farthest, fabs(splats->origin[k] + (double)splats->means[3 * i + k]));
         if (row % stride == 0) samples[n++] = (double)gsf__mean_log_scale(splats, i);
@@ -1700,11 +1700,6 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
     qsort(samples, n, sizeof samples[0], gsf__compare_doubles);
     job->typical = n ? exp(samples[n / 2]) : 1.0;
     return GSF_OK;
-}
-
-static void gsf__pack_free(gsf_context* ctx, gsf__pack* job) {
-    gsf_free(ctx, job->rows);
-    gsf_free(ctx, job->bad);
 }
 
 // Warns when positions are too coarse for the size of the splats. step: distance between adjacent coordinate values.
@@ -1771,7 +1766,7 @@ static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
     for (size_t row = begin; row < gsf__codec_end(job->count, begin); row++) {
-        const size_t i = job->rows ? job->rows[row] : row;
+        const size_t i = job->rows[row];
         unsigned char* p = job->out + GSF__SPLAT_ROW * row;
         float q[4];
         for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, (float)(s->origin[k] + (double)s->means[3 * i + k]));
@@ -2083,7 +2078,7 @@ static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const double units = ldexp(1.0, job->fraction);
     (void)worker;
     for (size_t row = begin; row < gsf__codec_end(job->count, begin); row++) {
-        const size_t i = job->rows ? job->rows[row] : row;
+        const size_t i = job->rows[row];
         unsigned char* sh = to->sh + 3 * (bands - 1) * row;
         for (size_t k = 0; k < 3; k++) {
             const double p = (s->origin[k] + (double)s->means[3 * i + k]) * units * (double)gsf__spz_axes[k];
@@ -2121,7 +2116,7 @@ static void gsf__spz_warn_scales(gsf_context* ctx, const gsf__pack* job) {
     const gsf_splats* s = job->splats;
     size_t clamped = 0;
     for (size_t row = 0; row < job->count; row++) {
-        const float* v = s->log_scales + 3 * (job->rows ? job->rows[row] : row);
+        const float* v = s->log_scales + 3 * job->rows[row];
         const float largest = fmaxf(fmaxf(v[0], v[1]), v[2]);
         clamped += largest > 6.0f || largest < -10.0f;
     }
@@ -2261,28 +2256,43 @@ typedef struct gsf__sfm_image {
 } gsf__sfm_image;
 
 typedef struct gsf__sfm {
+    gsf_scene* scene; // receives the points; tracks hold image ids until gsf__scene_map_tracks
     gsf__sfm_camera* cameras;
     gsf__sfm_image* images;
-    double* points;
-    uint8_t* colors;
-    uint64_t* point_ids;
-    size_t* track_begin; // track_count after each point; gsf_scene's array has a leading zero
-    uint32_t* tracks;    // image ids
-    size_t camera_count, image_count, point_count, track_count;
-    size_t camera_room, image_room, point_room, color_room, id_room, begin_room, track_room;
+    size_t camera_count, image_count;
+    size_t camera_room, image_room, point_room, track_room;
     size_t dropped_points; // points with a NaN or infinite position
     const char* images_name;
 } gsf__sfm;
 
-static void gsf__sfm_destroy(gsf_context* ctx, gsf__sfm* m) {
-    gsf_free(ctx, m->cameras);
-    gsf_free(ctx, m->images);
-    gsf_free(ctx, m->points);
-    gsf_free(ctx, m->colors);
-    gsf_free(ctx, m->point_ids);
-    gsf_free(ctx, m->track_begin);
-    gsf_free(ctx, m->tracks);
+// Makes room for `count` points, their track_begin included.
+static gsf_result gsf__sfm_reserve_points(gsf_context* ctx, gsf__sfm* m, size_t count) {
+    gsf_scene* s = m->scene;
+    void** const arrays[4] = {(void**)&s->points, (void**)&s->colors, (void**)&s->point_ids, (void**)&s->track_begin};
+    const size_t sizes[4] = {3 * sizeof(double), 3, sizeof(uint64_t), sizeof(size_t)};
+    const size_t used = m->point_room ? s->point_count + 1 : 0;
+    size_t room = 0;
+    if (count < m->point_room) return GSF_OK;
+    for (int k = 0; k < 4; k++) {
+        room = m->point_room;
+        GSF__TRY(gsf__reserve(ctx, arrays[k], &room, used, count + 1, sizes[k]));
+    }
+    m->point_room = room;
+    return GSF_OK;
+}
+
+static gsf_result gsf__sfm_reserve_tracks(gsf_context* ctx, gsf__sfm* m, size_t used, size_t count) {
+    return gsf__reserve(ctx, (void**)&m->scene->track_views, &m->track_room, used, count, sizeof(uint32_t));
+}
+
+// Prepares to read a model into an empty scene. No array stays NULL, so that callers of the library need no checks.
+static gsf_result gsf__sfm_init(gsf_context* ctx, gsf__sfm* m, gsf_scene* scene) {
     memset(m, 0, sizeof *m);
+    memset(scene, 0, sizeof *scene);
+    m->scene = scene;
+    GSF__TRY(gsf__sfm_reserve_points(ctx, m, 0));
+    scene->track_begin[0] = 0;
+    return gsf__sfm_reserve_tracks(ctx, m, 0, 1);
 }
 
 enum { GSF__LENS_PARAMS_MAX = 16, GSF__LENS_SIZE_MAX = 1000000 };
@@ -2348,6 +2358,25 @@ static gsf__lens gsf__lens_from_params(const gsf__lens_model* info, int32_t widt
     return lens;
 }
 
+static gsf_result gsf__sfm_push_camera(gsf_context* ctx, gsf__sfm* m, const gsf__sfm_camera* camera) {
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
+                          sizeof *m->cameras));
+    m->cameras[m->camera_count++] = *camera;
+    return GSF_OK;
+}
+
+static gsf_result gsf__sfm_push_image(gsf_context* ctx, gsf__sfm* m, const gsf__sfm_image* image) {
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1,
+                          sizeof *m->images));
+    m->images[m->image_count++] = *image;
+    return GSF_OK;
+}
+
+static int gsf__compare_ids(const void* a, const void* b) { // of cameras or of images: the first member of both
+    const uint32_t x = *(const uint32_t*)a, y = *(const uint32_t*)b;
+    return (x > y) - (x < y);
+}
+
 // Validates and adds a camera. name, at: its file and position, for error messages. params: as many as the model has.
 static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
                                       int model, uint64_t width, uint64_t height, const double* params) {
@@ -2370,24 +2399,7 @@ static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char*
     const char* fault = gsf__lens_fault(&camera.lens);
     if (fault)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: %s: %s", name, at, (unsigned)id, info->name, fault);
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
-                          sizeof *m->cameras));
-    m->cameras[m->camera_count++] = camera;
-    return GSF_OK;
-}
-
-static int gsf__compare_cameras(const void* a, const void* b) {
-    const uint32_t x = ((const gsf__sfm_camera*)a)->id, y = ((const gsf__sfm_camera*)b)->id;
-    return (x > y) - (x < y);
-}
-
-static gsf_result gsf__sfm_finish_cameras(gsf_context* ctx, gsf__sfm* m, const char* name) {
-    if (m->camera_count == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no camera in the file", name);
-    qsort(m->cameras, m->camera_count, sizeof *m->cameras, gsf__compare_cameras);
-    for (size_t i = 1; i < m->camera_count; i++)
-        if (m->cameras[i].id == m->cameras[i - 1].id)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: camera %u occurs twice", name, (unsigned)m->cameras[i].id);
-    return GSF_OK;
+    return gsf__sfm_push_camera(ctx, m, &camera);
 }
 
 // Converts a quaternion (w x y z, any non-zero length) and a translation to a world-to-camera matrix. Returns 0 if they
@@ -2418,329 +2430,314 @@ static int gsf__pose_from_quaternion(const double q_in[4], const double t[3], do
 
 static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
                                      const double pose[7], uint32_t camera_id, const char* image, size_t image_size) {
-    gsf__sfm_image* out;
-    const gsf__sfm_camera* camera;
-    gsf__sfm_camera wanted;
-    memset(&wanted, 0, sizeof wanted);
-    wanted.id = camera_id;
-    camera = (const gsf__sfm_camera*)bsearch(&wanted, m->cameras, m->camera_count, sizeof wanted, gsf__compare_cameras);
+    gsf__sfm_image out;
+    const gsf__sfm_camera* camera = (const gsf__sfm_camera*)bsearch(&camera_id, m->cameras, m->camera_count,
+                                                                    sizeof *m->cameras, gsf__compare_ids);
     if (!camera)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image %u: camera %u does not exist", name, at, (unsigned)id,
                         (unsigned)camera_id);
     if (image_size == 0 || memchr(image, 0, image_size))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image %u: empty or malformed name", name, at, (unsigned)id);
-    GSF__TRY(
-        gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
-    out = &m->images[m->image_count];
-    if (!gsf__pose_from_quaternion(pose, pose + 4, out->w2c))
+    if (!gsf__pose_from_quaternion(pose, pose + 4, out.w2c))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC,
                         "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is not a rotation and translation", name, at,
                         (unsigned)id, pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]);
-    out->id = id;
-    out->camera_id = camera_id;
-    out->camera = (size_t)(camera - m->cameras);
-    out->at = at;
-    out->name = image;
-    out->name_size = image_size;
-    m->image_count++;
-    return GSF_OK;
+    out.id = id;
+    out.camera_id = camera_id;
+    out.camera = (size_t)(camera - m->cameras);
+    out.at = at;
+    out.name = image;
+    out.name_size = image_size;
+    return gsf__sfm_push_image(ctx, m, &out);
 }
 
 // Adds a point with an empty track. A point with a non-finite position is only counted (*added = 0).
 static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id, const double xyz[3],
                                      const uint8_t rgb[3], int* added) {
-    const size_t n = m->point_count;
+    gsf_scene* s = m->scene;
+    const size_t n = s->point_count;
     *added = isfinite(xyz[0]) && isfinite(xyz[1]) && isfinite(xyz[2]);
     if (!*added) {
         m->dropped_points++;
         return GSF_OK;
     }
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->points, &m->point_room, n, n + 1, 3 * sizeof(double)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->colors, &m->color_room, n, n + 1, 3));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->point_ids, &m->id_room, n, n + 1, sizeof(uint64_t)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->track_begin, &m->begin_room, n ? n + 1 : 0, n + 2, sizeof(size_t)));
-    memcpy(m->points + 3 * n, xyz, 3 * sizeof(double));
-    memcpy(m->colors + 3 * n, rgb, 3);
-    m->point_ids[n] = id;
-    m->track_begin[0] = 0;
-    m->track_begin[n + 1] = m->track_count;
-    m->point_count++;
+    GSF__TRY(gsf__sfm_reserve_points(ctx, m, n + 1));
+    memcpy(s->points + 3 * n, xyz, 3 * sizeof(double));
+    memcpy(s->colors + 3 * n, rgb, 3);
+    s->point_ids[n] = id;
+    s->track_begin[n + 1] = s->track_begin[n];
+    s->point_count++;
     return GSF_OK;
 }
 
-static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) { // of the last point
-    GSF__TRY(
-        gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, m->track_count, m->track_count + 1, sizeof(uint32_t)));
-    m->tracks[m->track_count++] = image_id;
-    m->track_begin[m->point_count] = m->track_count;
-    return GSF_OK;
-}
-
-typedef struct gsf__cursor { // a binary file being read
+// One of the three files being read. A binary and a text file have the same fields in the same order, so one function
+// reads a record of either; the numbers of bytes that it passes apply to binary files, `what` to messages about text.
+typedef struct gsf__reader {
     const char* name;
-    const unsigned char* data;
-    size_t size, at;
-} gsf__cursor;
+    int32_t is_text;
+    const char *data, *at, *end; // the file, what is next in it, its end (text: of the current line)
+    const char *next, *file_end; // text: the lines not yet read
+    size_t line;                 // text: number of the current line, from 1
+} gsf__reader;
 
-static gsf__cursor gsf__make_cursor(const gsf_bytes* bytes, const char* fallback_name) {
-    gsf__cursor c;
-    c.name = bytes->name ? bytes->name : fallback_name;
-    c.data = (const unsigned char*)(bytes->data ? bytes->data : "");
-    c.size = bytes->data ? bytes->size : 0;
-    c.at = 0;
-    return c;
+static gsf__reader gsf__make_reader(const gsf_bytes* bytes, int32_t is_text, const char* binary, const char* text) {
+    gsf__reader r;
+    memset(&r, 0, sizeof r);
+    r.name = bytes->name ? bytes->name : is_text ? text : binary;
+    r.is_text = is_text;
+    r.data = r.at = r.end = r.next = (const char*)(bytes->data ? bytes->data : "");
+    r.file_end = r.data + (bytes->data ? bytes->size : 0);
+    if (!is_text) r.end = r.file_end;
+    return r;
 }
 
-// Consumes and returns the next `bytes` bytes; NULL, with the error set, when the file is too short.
-static const unsigned char* gsf__take(gsf_context* ctx, gsf__cursor* c, size_t bytes, const char* what) {
-    if (bytes > c->size - c->at) {
-        (void)gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends inside %s", c->name, c->at, what);
-        return NULL;
-    }
-    c->at += bytes;
-    return c->data + c->at - bytes;
+static size_t gsf__position(const gsf__reader* r) { return r->is_text ? r->line : (size_t)(r->at - r->data); }
+
+static void gsf__skip_blanks(gsf__reader* r) {
+    while (r->at < r->end && gsf__is_blank((unsigned char)*r->at)) r->at++;
 }
 
-// Reads a count of records of at least `record` bytes each and checks it against the rest of the file.
-static gsf_result gsf__take_count(gsf_context* ctx, gsf__cursor* c, size_t record, const char* what, size_t* out) {
-    const unsigned char* p = gsf__take(ctx, c, 8, what);
-    if (!p) return GSF_ERROR_FORMAT;
-    const uint64_t count = gsf__load_le(p, 8);
-    if (count > (c->size - c->at) / record)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %llu %s do not fit the file", c->name, c->at - 8,
+static int gsf__next_line(gsf__reader* r) { // 0 at the end of the file
+    if (r->next == r->file_end) return 0;
+    const char* stop = (const char*)memchr(r->next, '\n', (size_t)(r->file_end - r->next));
+    r->at = r->next;
+    r->end = stop ? stop : r->file_end;
+    r->next = stop ? stop + 1 : r->file_end;
+    r->line++;
+    return 1;
+}
+
+// Checks that `bytes` more bytes follow, for the fields that are read next.
+static gsf_result gsf__need(gsf_context* ctx, const gsf__reader* r, size_t bytes, const char* what) {
+    if (r->is_text || bytes <= (size_t)(r->end - r->at)) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends inside %s", r->name, gsf__position(r), what);
+}
+
+// Reads a count of records of at least `record` bytes each and checks it against the rest of the file. Text has none.
+static gsf_result gsf__read_count(gsf_context* ctx, gsf__reader* r, size_t record, const char* what, size_t* out) {
+    *out = 0;
+    if (r->is_text) return GSF_OK;
+    GSF__TRY(gsf__need(ctx, r, 8, what));
+    const uint64_t count = gsf__load_le(r->at, 8);
+    if (count > ((size_t)(r->end - r->at) - 8) / record)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %llu %s do not fit the file", r->name, gsf__position(r),
                         (unsigned long long)count, what);
+    r->at += 8;
     *out = (size_t)count;
     return GSF_OK;
 }
 
-static gsf_result gsf__cursor_end(gsf_context* ctx, const gsf__cursor* c) {
-    if (c->at == c->size) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes after the last record", c->name, c->at, c->size - c->at);
-}
-
-static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
-    size_t count;
-    GSF__TRY(gsf__take_count(ctx, c, 24 + 2 * 8, "cameras", &count));
-    for (size_t i = 0; i < count; i++) {
-        const size_t at = c->at;
-        const unsigned char* p = gsf__take(ctx, c, 24, "a camera");
-        if (!p) return GSF_ERROR_FORMAT;
-        const uint32_t id = (uint32_t)gsf__load_le(p, 4), model = (uint32_t)gsf__load_le(p + 4, 4);
-        if (model >= GSF__COUNT(gsf__lens_models))
-            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %u: unknown camera model %d (colmap "
-                            "image_undistorter makes pinhole cameras of it)", c->name, at + 4, (unsigned)id, (int)model);
-        const unsigned char* values =
-            gsf__take(ctx, c, 8u * gsf__lens_models[model].param_count, "a camera's parameters");
-        if (!values) return GSF_ERROR_FORMAT;
-        double params[GSF__LENS_PARAMS_MAX];
-        for (int k = 0; k < gsf__lens_models[model].param_count; k++) params[k] = gsf__load_f64(values + 8 * k);
-        GSF__TRY(gsf__sfm_add_camera(ctx, m, c->name, at, id, (int)model, gsf__load_le(p + 8, 8),
-                                     gsf__load_le(p + 16, 8), params));
-    }
-    return gsf__cursor_end(ctx, c);
-}
-
-static gsf_result gsf__colmap_images_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
-    size_t count, observations;
-    GSF__TRY(gsf__take_count(ctx, c, 64 + 2 + 8, "images", &count));
-    for (size_t i = 0; i < count; i++) {
-        const size_t at = c->at;
-        const unsigned char* p = gsf__take(ctx, c, 64, "an image");
-        if (!p) return GSF_ERROR_FORMAT;
-        double pose[7];
-        for (int k = 0; k < 7; k++) pose[k] = gsf__load_f64(p + 4 + 8 * k);
-        const char* image = (const char*)c->data + c->at;
-        const char* stop = c->at < c->size ? (const char*)memchr(image, 0, c->size - c->at) : NULL;
-        if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: unterminated image name", c->name, c->at);
-        c->at += (size_t)(stop - image) + 1;
-        GSF__TRY(gsf__take_count(ctx, c, 24, "2D points", &observations));
-        c->at += 24 * observations;
-        GSF__TRY(gsf__sfm_add_image(ctx, m, c->name, at, (uint32_t)gsf__load_le(p, 4), pose,
-                                    (uint32_t)gsf__load_le(p + 60, 4), image, (size_t)(stop - image)));
-    }
-    return gsf__cursor_end(ctx, c);
-}
-
-static gsf_result gsf__colmap_points_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
-    size_t count, track;
-    int added;
-    GSF__TRY(gsf__take_count(ctx, c, 43 + 8, "points", &count));
-    // Allocates the tracks once: all bytes that are not the fixed part of a record are track entries.
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->points, &m->point_room, 0, count, 3 * sizeof(double)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->colors, &m->color_room, 0, count, 3));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->point_ids, &m->id_room, 0, count, sizeof(uint64_t)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->track_begin, &m->begin_room, 0, count + 1, sizeof(size_t)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, 0, (c->size - c->at - 51 * count) / 8, 4));
-    for (size_t i = 0; i < count; i++) {
-        const unsigned char* p = gsf__take(ctx, c, 43, "a point");
-        if (!p) return GSF_ERROR_FORMAT;
-        double xyz[3];
-        for (int k = 0; k < 3; k++) xyz[k] = gsf__load_f64(p + 8 + 8 * k);
-        GSF__TRY(gsf__take_count(ctx, c, 8, "track entries", &track));
-        GSF__TRY(gsf__sfm_add_point(ctx, m, gsf__load_le(p, 8), xyz, p + 32, &added));
-        for (size_t k = 0; k < track && added; k++)
-            GSF__TRY(gsf__sfm_add_track(ctx, m, (uint32_t)gsf__load_le(c->data + c->at + 8 * k, 4)));
-        c->at += 8 * track;
-    }
-    return gsf__cursor_end(ctx, c);
-}
-
-typedef struct gsf__line { // a text file being read line by line
-    const char* name;
-    const char *next, *file_end; // the lines not yet read
-    const char *at, *end;        // rest of the current line
-    size_t number;               // from 1
-} gsf__line;
-
-static gsf__line gsf__make_lines(const gsf_bytes* bytes, const char* fallback_name) {
-    gsf__line l;
-    memset(&l, 0, sizeof l);
-    l.name = bytes->name ? bytes->name : fallback_name;
-    l.next = (const char*)(bytes->data ? bytes->data : "");
-    l.file_end = l.next + (bytes->data ? bytes->size : 0);
-    return l;
-}
-
-static int gsf__next_line(gsf__line* l) { // 0 at the end of the file
-    if (l->next == l->file_end) return 0;
-    const char* stop = (const char*)memchr(l->next, '\n', (size_t)(l->file_end - l->next));
-    l->at = l->next;
-    l->end = stop ? stop : l->file_end;
-    l->next = stop ? stop + 1 : l->file_end;
-    l->number++;
-    return 1;
-}
-
-static int gsf__next_record(gsf__line* l) { // as gsf__next_line, but skips empty lines and comments
-    while (gsf__next_line(l)) {
-        while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
-        if (l->at < l->end && *l->at != '#') return 1;
+// Goes to the next of `left` records; in text, to the next line that is neither empty nor a comment. Returns 0 if there
+// is none.
+static int gsf__next_record(gsf__reader* r, size_t* left) {
+    if (!r->is_text) return (*left)-- > 0;
+    while (gsf__next_line(r)) {
+        gsf__skip_blanks(r);
+        if (r->at < r->end && *r->at != '#') return 1;
     }
     return 0;
 }
 
-static gsf_result gsf__take_u64(gsf_context* ctx, gsf__line* l, uint64_t max, const char* what, uint64_t* out) {
-    const char* word;
-    const size_t length = gsf__next_word(&l->at, l->end, &word);
-    if (gsf__word_u64(word, length, out) && *out <= max) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got \"%.*s\"", l->name, l->number, what,
+static gsf_result gsf__unexpected(gsf_context* ctx, const gsf__reader* r, const char* what, const char* word,
+                                  size_t length) {
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got \"%.*s\"", r->name, r->line, what,
                     (int)(length < 40 ? length : 40), word);
 }
 
-static gsf_result gsf__take_double(gsf_context* ctx, gsf__line* l, const char* what, double* out) {
+static gsf_result gsf__parse_uint(gsf_context* ctx, gsf__reader* r, uint64_t most, const char* what, uint64_t* out) {
     const char* word;
-    const size_t length = gsf__next_word(&l->at, l->end, &word);
-    if (length && gsf__word_double(word, length, out)) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got \"%.*s\"", l->name, l->number, what,
-                    (int)(length < 40 ? length : 40), word);
+    const size_t length = gsf__next_word(&r->at, r->end, &word);
+    if (gsf__word_u64(word, length, out) && *out <= most) return GSF_OK;
+    return gsf__unexpected(ctx, r, what, word, length);
 }
 
-static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
-    while (gsf__next_record(l)) {
-        uint64_t id, width, height;
+static inline gsf_result gsf__read_uint(gsf_context* ctx, gsf__reader* r, int bytes, const char* what, uint64_t* out) {
+    if (r->is_text) return gsf__parse_uint(ctx, r, UINT64_MAX >> (64 - 8 * bytes), what, out);
+    *out = gsf__load_le(r->at, bytes);
+    r->at += bytes;
+    return GSF_OK;
+}
+
+static gsf_result gsf__read_doubles(gsf_context* ctx, gsf__reader* r, int count, const char* what, double* out) {
+    for (int k = 0; k < count; k++) {
         const char* word;
-        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &id));
-        const size_t length = gsf__next_word(&l->at, l->end, &word);
-        int model = 0;
-        while (model < (int)GSF__COUNT(gsf__lens_models) && !gsf__word_is(word, length, gsf__lens_models[model].name))
-            model++;
-        if (model == (int)GSF__COUNT(gsf__lens_models))
-            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\" (colmap "
-                            "image_undistorter makes pinhole cameras of it)", l->name, l->number, (unsigned long long)id,
-                            (int)(length < 40 ? length : 40), word);
-        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a width", &width));
-        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a height", &height));
-        double params[GSF__LENS_PARAMS_MAX];
-        for (int k = 0; k < gsf__lens_models[model].param_count; k++)
-            GSF__TRY(gsf__take_double(ctx, l, "a camera parameter", &params[k]));
-        if (gsf__next_word(&l->at, l->end, &word))
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %llu: %s takes %d parameters, found more", l->name,
-                            l->number, (unsigned long long)id, gsf__lens_models[model].name,
-                            (int)gsf__lens_models[model].param_count);
-        GSF__TRY(gsf__sfm_add_camera(ctx, m, l->name, l->number, (uint32_t)id, model, width, height, params));
+        if (!r->is_text) {
+            out[k] = gsf__load_f64(r->at);
+            r->at += 8;
+            continue;
+        }
+        const size_t length = gsf__next_word(&r->at, r->end, &word);
+        if (!length || !gsf__word_double(word, length, &out[k])) return gsf__unexpected(ctx, r, what, word, length);
     }
     return GSF_OK;
 }
 
-static gsf_result gsf__colmap_images_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
-    while (gsf__next_record(l)) {
-        uint64_t id, camera;
-        double pose[7];
+// After the last record.
+static gsf_result gsf__reader_end(gsf_context* ctx, const gsf__reader* r) {
+    if (r->is_text || r->at == r->end) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes after the last record", r->name, gsf__position(r),
+                    (size_t)(r->end - r->at));
+}
+
+// Reads a camera's model: its id, in text its name.
+static gsf_result gsf__read_model(gsf_context* ctx, gsf__reader* r, uint64_t camera, uint32_t* model) {
+    const size_t at = gsf__position(r);
+    char shown[48];
+    if (r->is_text) {
         const char* word;
-        const size_t number = l->number;
-        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "an image id", &id));
-        for (int k = 0; k < 7; k++) GSF__TRY(gsf__take_double(ctx, l, "a pose (QW QX QY QZ TX TY TZ)", &pose[k]));
-        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &camera));
-        // The name is the rest of the line and may contain spaces.
-        while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
-        const char *image = l->at, *stop = l->end;
-        while (stop > image && gsf__is_blank((unsigned char)stop[-1])) stop--;
-        size_t values = 0; // in the line of 2D points, which may be empty, or missing at the end of the file
-        if (gsf__next_line(l))
-            while (gsf__next_word(&l->at, l->end, &word)) values++;
-        if (values % 3)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu values, expected 2D points as X Y POINT3D_ID", l->name,
-                            l->number, values);
-        GSF__TRY(gsf__sfm_add_image(ctx, m, l->name, number, (uint32_t)id, pose, (uint32_t)camera, image,
-                                    (size_t)(stop - image)));
+        const size_t length = gsf__next_word(&r->at, r->end, &word);
+        for (*model = 0; *model < GSF__COUNT(gsf__lens_models); (*model)++)
+            if (gsf__word_is(word, length, gsf__lens_models[*model].name)) break;
+        snprintf(shown, sizeof shown, "\"%.*s\"", (int)(length < 40 ? length : 40), word);
+    } else {
+        *model = (uint32_t)gsf__load_le(r->at, 4);
+        r->at += 4;
+        snprintf(shown, sizeof shown, "%d", (int)*model);
     }
+    if (*model < GSF__COUNT(gsf__lens_models)) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                    "%s:%zu: camera %u: unknown camera model %s (colmap image_undistorter makes pinhole cameras of it)",
+                    r->name, at, (unsigned)camera, shown);
+}
+
+static gsf_result gsf__read_cameras(gsf_context* ctx, gsf__reader* r, gsf__sfm* m) {
+    uint64_t id = 0, width = 0, height = 0;
+    uint32_t model = 0;
+    double params[GSF__LENS_PARAMS_MAX];
+    const char* word;
+    size_t left;
+    GSF__TRY(gsf__read_count(ctx, r, 24 + 2 * 8, "cameras", &left));
+    while (gsf__next_record(r, &left)) {
+        const size_t at = gsf__position(r);
+        GSF__TRY(gsf__need(ctx, r, 24, "a camera"));
+        GSF__TRY(gsf__read_uint(ctx, r, 4, "a camera id", &id));
+        GSF__TRY(gsf__read_model(ctx, r, id, &model));
+        GSF__TRY(gsf__read_uint(ctx, r, 8, "a width", &width));
+        GSF__TRY(gsf__read_uint(ctx, r, 8, "a height", &height));
+        const gsf__lens_model* info = &gsf__lens_models[model];
+        GSF__TRY(gsf__need(ctx, r, 8u * info->param_count, "a camera's parameters"));
+        GSF__TRY(gsf__read_doubles(ctx, r, info->param_count, "a camera parameter", params));
+        if (r->is_text && gsf__next_word(&r->at, r->end, &word))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: %s takes %d parameters, found more", r->name,
+                            r->line, (unsigned)id, info->name, (int)info->param_count);
+        GSF__TRY(gsf__sfm_add_camera(ctx, m, r->name, at, (uint32_t)id, (int)model, width, height, params));
+    }
+    GSF__TRY(gsf__reader_end(ctx, r));
+    if (m->camera_count == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no camera in the file", r->name);
+    qsort(m->cameras, m->camera_count, sizeof *m->cameras, gsf__compare_ids);
+    for (size_t i = 1; i < m->camera_count; i++)
+        if (m->cameras[i].id == m->cameras[i - 1].id)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: camera %u occurs twice", r->name, (unsigned)m->cameras[i].id);
     return GSF_OK;
 }
 
-static gsf_result gsf__colmap_points_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
-    while (gsf__next_record(l)) {
-        uint64_t id, value;
-        double xyz[3], error;
-        uint8_t rgb[3];
-        int added;
-        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a point id", &id));
-        for (int k = 0; k < 3; k++) GSF__TRY(gsf__take_double(ctx, l, "a coordinate", &xyz[k]));
+// Reads an image's name: up to a NUL, in text the rest of the line, which may contain spaces.
+static gsf_result gsf__read_image_name(gsf_context* ctx, gsf__reader* r, const char** name, size_t* size) {
+    const char* stop = r->end;
+    if (r->is_text) {
+        gsf__skip_blanks(r);
+        while (stop > r->at && gsf__is_blank((unsigned char)stop[-1])) stop--;
+    } else {
+        stop = (const char*)memchr(r->at, 0, (size_t)(r->end - r->at));
+        if (!stop)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: unterminated image name", r->name, gsf__position(r));
+    }
+    *name = r->at;
+    *size = (size_t)(stop - r->at);
+    r->at = r->is_text ? r->end : stop + 1;
+    return GSF_OK;
+}
+
+// Skips an image's 2D points. In text they have a line of their own, which may be empty, or missing at the end of the
+// file.
+static gsf_result gsf__skip_observations(gsf_context* ctx, gsf__reader* r) {
+    const char* word;
+    size_t count, values = 0;
+    GSF__TRY(gsf__read_count(ctx, r, 24, "2D points", &count));
+    r->at += 24 * count;
+    if (r->is_text && gsf__next_line(r))
+        while (gsf__next_word(&r->at, r->end, &word)) values++;
+    if (values % 3 == 0) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu values, expected 2D points as X Y POINT3D_ID", r->name, r->line,
+                    values);
+}
+
+static gsf_result gsf__read_images(gsf_context* ctx, gsf__reader* r, gsf__sfm* m) {
+    uint64_t id = 0, camera = 0;
+    double pose[7];
+    const char* image = NULL;
+    size_t left, image_size = 0;
+    GSF__TRY(gsf__read_count(ctx, r, 64 + 2 + 8, "images", &left));
+    while (gsf__next_record(r, &left)) {
+        const size_t at = gsf__position(r);
+        GSF__TRY(gsf__need(ctx, r, 64, "an image"));
+        GSF__TRY(gsf__read_uint(ctx, r, 4, "an image id", &id));
+        GSF__TRY(gsf__read_doubles(ctx, r, 7, "a pose (QW QX QY QZ TX TY TZ)", pose));
+        GSF__TRY(gsf__read_uint(ctx, r, 4, "a camera id", &camera));
+        GSF__TRY(gsf__read_image_name(ctx, r, &image, &image_size));
+        GSF__TRY(gsf__skip_observations(ctx, r));
+        GSF__TRY(gsf__sfm_add_image(ctx, m, r->name, at, (uint32_t)id, pose, (uint32_t)camera, image, image_size));
+    }
+    return gsf__reader_end(ctx, r);
+}
+
+// Reads the track of a point: `count` entries, in text those up to the end of the line. added: it is the last point of
+// the model; else the track is dropped.
+static gsf_result gsf__read_track(gsf_context* ctx, gsf__reader* r, size_t count, int added, gsf__sfm* m) {
+    gsf_scene* s = m->scene;
+    uint64_t image = 0, index;
+    size_t end = s->track_begin[s->point_count];
+    GSF__TRY(gsf__sfm_reserve_tracks(ctx, m, end, end + count));
+    for (size_t k = 0; k < count; k++) s->track_views[end++] = (uint32_t)gsf__load_le(r->at + 8 * k, 4);
+    r->at += 8 * count;
+    if (r->is_text)
+        for (gsf__skip_blanks(r); r->at < r->end; gsf__skip_blanks(r)) {
+            GSF__TRY(gsf__read_uint(ctx, r, 4, "an image id", &image));
+            GSF__TRY(gsf__read_uint(ctx, r, 4, "a 2D point index", &index));
+            GSF__TRY(gsf__sfm_reserve_tracks(ctx, m, end, end + 1));
+            s->track_views[end++] = (uint32_t)image;
+        }
+    if (added) s->track_begin[s->point_count] = end;
+    return GSF_OK;
+}
+
+static gsf_result gsf__read_points(gsf_context* ctx, gsf__reader* r, gsf__sfm* m) {
+    uint64_t id = 0, value = 0;
+    double xyz[3], error;
+    uint8_t rgb[3];
+    size_t left, track;
+    int added;
+    GSF__TRY(gsf__read_count(ctx, r, 43 + 8, "points", &left));
+    // Allocates once: all bytes of a binary file that are not the fixed part of a record are track entries.
+    GSF__TRY(gsf__sfm_reserve_points(ctx, m, left));
+    if (!r->is_text) GSF__TRY(gsf__sfm_reserve_tracks(ctx, m, 0, ((size_t)(r->end - r->at) - 51 * left) / 8));
+    while (gsf__next_record(r, &left)) {
+        GSF__TRY(gsf__need(ctx, r, 43, "a point"));
+        GSF__TRY(gsf__read_uint(ctx, r, 8, "a point id", &id));
+        GSF__TRY(gsf__read_doubles(ctx, r, 3, "a coordinate", xyz));
         for (int k = 0; k < 3; k++) {
-            GSF__TRY(gsf__take_u64(ctx, l, 255, "a colour 0..255", &value));
+            GSF__TRY(gsf__read_uint(ctx, r, 1, "a colour 0..255", &value));
             rgb[k] = (uint8_t)value;
         }
-        GSF__TRY(gsf__take_double(ctx, l, "the reprojection error", &error));
+        GSF__TRY(gsf__read_doubles(ctx, r, 1, "the reprojection error", &error));
+        GSF__TRY(gsf__read_count(ctx, r, 8, "track entries", &track));
         GSF__TRY(gsf__sfm_add_point(ctx, m, id, xyz, rgb, &added));
-        for (;;) {
-            while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
-            if (l->at == l->end) break;
-            uint64_t image, index;
-            GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "an image id", &image));
-            GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a 2D point index", &index));
-            if (added) GSF__TRY(gsf__sfm_add_track(ctx, m, (uint32_t)image));
-        }
+        GSF__TRY(gsf__read_track(ctx, r, track, added, m));
     }
-    return GSF_OK;
+    return gsf__reader_end(ctx, r);
 }
 
-// points: may be NULL. The image names in *m point into `images`. *m must be destroyed even after an error.
+// points: may be NULL. The image names in *m point into `images`.
 static gsf_result gsf__colmap_read(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras, const gsf_bytes* images,
                                    const gsf_bytes* points, gsf__sfm* m) {
-    memset(m, 0, sizeof *m);
-    if (is_text) {
-        gsf__line l = gsf__make_lines(cameras, "cameras.txt");
-        GSF__TRY(gsf__colmap_cameras_txt(ctx, &l, m));
-        GSF__TRY(gsf__sfm_finish_cameras(ctx, m, l.name));
-        l = gsf__make_lines(images, "images.txt");
-        m->images_name = l.name;
-        GSF__TRY(gsf__colmap_images_txt(ctx, &l, m));
-        if (points) {
-            l = gsf__make_lines(points, "points3D.txt");
-            GSF__TRY(gsf__colmap_points_txt(ctx, &l, m));
-        }
-    } else {
-        gsf__cursor c = gsf__make_cursor(cameras, "cameras.bin");
-        GSF__TRY(gsf__colmap_cameras_bin(ctx, &c, m));
-        GSF__TRY(gsf__sfm_finish_cameras(ctx, m, c.name));
-        c = gsf__make_cursor(images, "images.bin");
-        m->images_name = c.name;
-        GSF__TRY(gsf__colmap_images_bin(ctx, &c, m));
-        if (points) {
-            c = gsf__make_cursor(points, "points3D.bin");
-            GSF__TRY(gsf__colmap_points_bin(ctx, &c, m));
-        }
-    }
-    return GSF_OK;
+    gsf__reader r = gsf__make_reader(cameras, is_text, "cameras.bin", "cameras.txt");
+    GSF__TRY(gsf__read_cameras(ctx, &r, m));
+    r = gsf__make_reader(images, is_text, "images.bin", "images.txt");
+    m->images_name = r.name;
+    GSF__TRY(gsf__read_images(ctx, &r, m));
+    if (!points) return GSF_OK;
+    r = gsf__make_reader(points, is_text, "points3D.bin", "points3D.txt");
+    return gsf__read_points(ctx, &r, m);
 }
 
 // ---- >>transforms --------------------------------------------------------------
@@ -2751,31 +2748,24 @@ static gsf_result gsf__colmap_read(gsf_context* ctx, int32_t is_text, const gsf_
    in the file: nerfstudio's applied_transform has already been applied to the cameras and to the points of
    ply_file_path, and instant-ngp's scale, offset and aabb_scale only place its own grid. */
 
-static const char* gsf__json_where(const gsf_json* json) { return json->name; }
+// What a frame may override: numbers, in the order of gsf__transforms_add_camera, and what kind of camera it is.
+enum { GSF__TRANSFORMS_CX = 12, GSF__TRANSFORMS_NUMBERS = 14 };
+static const char* const gsf__transforms_keys[GSF__TRANSFORMS_NUMBERS + 2] = {
+    "k1",   "k2",   "p1",             "p2",             "k3", "k4", "w",            "h",
+    "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "camera_model", "is_fisheye"};
 
-// Reads a number from the frame, else from the top level, else `fallback`.
-static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
-                                    const char* key, double fallback, double* out) {
+// Finds a member of the frame, else of the top level.
+static const gsf_json_value* gsf__transforms_find(const gsf_json* json, const gsf_json_value* frame, const char* key) {
     const gsf_json_value* value = gsf_find_json_member(json, frame, key);
-    if (!value) value = gsf_find_json_member(json, &json->values[0], key);
-    *out = fallback;
-    if (!value) return GSF_OK;
-    if (value->type != GSF_JSON_NUMBER)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: \"%s\" is not a number", gsf__json_where(json),
-                        (unsigned)value->offset, key);
-    *out = value->number;
-    return GSF_OK;
+    return value ? value : gsf_find_json_member(json, &json->values[0], key);
 }
 
 static gsf_result gsf__transforms_lens_kind(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                             gsf__lens_kind* out) {
     static const char* const perspective[6] = {"OPENCV", "PINHOLE",     "SIMPLE_PINHOLE",
                                                "RADIAL", "FULL_OPENCV", "SIMPLE_RADIAL"};
-    const gsf_json_value* root = &json->values[0];
-    const gsf_json_value* model = gsf_find_json_member(json, frame, "camera_model");
-    const gsf_json_value* fisheye = gsf_find_json_member(json, frame, "is_fisheye"); // instant-ngp
-    if (!model) model = gsf_find_json_member(json, root, "camera_model");
-    if (!fisheye) fisheye = gsf_find_json_member(json, root, "is_fisheye");
+    const gsf_json_value* model = gsf__transforms_find(json, frame, "camera_model");
+    const gsf_json_value* fisheye = gsf__transforms_find(json, frame, "is_fisheye"); // instant-ngp
     *out = fisheye && fisheye->type == GSF_JSON_TRUE ? GSF__LENS_FISHEYE : GSF__LENS_RATIONAL;
     if (!model) return GSF_OK;
     const char* name = model->type == GSF_JSON_STRING ? model->string : "";
@@ -2783,61 +2773,53 @@ static gsf_result gsf__transforms_lens_kind(gsf_context* ctx, const gsf_json* js
         if (strcmp(name, perspective[i]) == 0) return GSF_OK;
     *out = GSF__LENS_FISHEYE;
     if (strcmp(name, "OPENCV_FISHEYE") == 0) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: camera_model \"%.40s\" is not supported", gsf__json_where(json),
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: camera_model \"%.40s\" is not supported", json->name,
                     (unsigned)model->offset, name);
 }
 
 // Adds the camera of a frame (NULL: of the top level) to the model.
 static gsf_result gsf__transforms_add_camera(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                              gsf__sfm* m) {
-    static const char* const keys[8] = {"k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"};
-    const char* where = gsf__json_where(json);
     const unsigned at = (unsigned)(frame ? frame->offset : 0);
     gsf__sfm_camera camera;
     double width, height;
     int distorted = 0;
     memset(&camera, 0, sizeof camera);
     gsf__lens* lens = &camera.lens;
+    double* const k = lens->k;
+    double* const numbers[GSF__TRANSFORMS_NUMBERS] = {
+        k,         k + 1,     k + 2,           k + 3,           k + 4,     k + 5,     &width,
+        &height,   &lens->fx, &lens->fy,       &camera.angle_x, &camera.angle_y, &lens->cx, &lens->cy};
     camera.id = (uint32_t)m->camera_count;
     camera.open = 1;
     GSF__TRY(gsf__transforms_lens_kind(ctx, json, frame, &lens->kind));
-    for (int i = 0; i < 6; i++) {
-        GSF__TRY(gsf__json_setting(ctx, json, frame, keys[i], 0.0, &lens->k[i]));
-        distorted = distorted || lens->k[i] != 0.0;
+    for (int i = 0; i < GSF__TRANSFORMS_NUMBERS; i++) {
+        const gsf_json_value* value = gsf__transforms_find(json, frame, gsf__transforms_keys[i]);
+        if (value && value->type != GSF_JSON_NUMBER)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: \"%s\" is not a number", json->name,
+                            (unsigned)value->offset, gsf__transforms_keys[i]);
+        *numbers[i] = value ? value->number : i < GSF__TRANSFORMS_CX ? 0.0 : (double)NAN;
     }
+    for (int i = 0; i < 6; i++) distorted = distorted || k[i] != 0.0;
     if (lens->kind == GSF__LENS_RATIONAL && !distorted) lens->kind = GSF__LENS_PINHOLE;
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "w", 0.0, &width));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "h", 0.0, &height));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "fl_x", 0.0, &lens->fx));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "fl_y", 0.0, &lens->fy));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "camera_angle_x", 0.0, &camera.angle_x));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "camera_angle_y", 0.0, &camera.angle_y));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "cx", (double)NAN, &lens->cx));
-    GSF__TRY(gsf__json_setting(ctx, json, frame, "cy", (double)NAN, &lens->cy));
     const double size_max = (double)GSF__LENS_SIZE_MAX;
     if (!(width >= 0.0 && height >= 0.0 && width <= size_max && height <= size_max &&
           (width >= 1.0) == (height >= 1.0)))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: image size %g x %g", where, at, width, height);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: image size %g x %g", json->name, at, width, height);
     lens->width = (int32_t)width;
     lens->height = (int32_t)height;
     const double pi = 3.14159265358979;
     if (!(lens->fx > 0.0) && !(camera.angle_x > 0.0 && camera.angle_x < pi))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: neither fl_x > 0 nor camera_angle_x between 0 and pi", where,
-                        at);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: neither fl_x > 0 nor camera_angle_x between 0 and pi",
+                        json->name, at);
     if (lens->fx < 0.0 || lens->fy < 0.0 || camera.angle_y < 0.0 || camera.angle_y > pi)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: negative focal length or field of view", where, at);
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
-                          sizeof *m->cameras));
-    m->cameras[m->camera_count++] = camera;
-    return GSF_OK;
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: negative focal length or field of view", json->name, at);
+    return gsf__sfm_push_camera(ctx, m, &camera);
 }
 
 static int gsf__transforms_has_camera(const gsf_json* json, const gsf_json_value* frame) {
-    static const char* const keys[16] = {"w",  "h",  "fl_x", "fl_y", "cx", "cy", "k1",           "k2",
-                                         "k3", "k4", "p1",   "p2",   "camera_angle_x", "camera_angle_y",
-                                         "camera_model", "is_fisheye"};
-    for (int i = 0; i < 16; i++)
-        if (gsf_find_json_member(json, frame, keys[i])) return 1;
+    for (size_t i = 0; i < GSF__COUNT(gsf__transforms_keys); i++)
+        if (gsf_find_json_member(json, frame, gsf__transforms_keys[i])) return 1;
     return 0;
 }
 
@@ -2879,14 +2861,13 @@ static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
 
 static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                             size_t camera, gsf__sfm* m) {
-    const char* where = gsf__json_where(json);
     const gsf_json_value* path = gsf_find_json_member(json, frame, "file_path");
     const gsf_json_value* matrix = gsf_find_json_member(json, frame, "transform_matrix");
     double rows[12];
     if (!path || path->type != GSF_JSON_STRING)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without file_path", where, (unsigned)frame->offset);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without file_path", json->name, (unsigned)frame->offset);
     if (!matrix || matrix->type != GSF_JSON_ARRAY || (matrix->count != 4 && matrix->count != 3))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", where,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", json->name,
                         (unsigned)frame->offset);
     for (size_t r = 0; r < 3; r++) {
         const gsf_json_value* row = gsf_find_json_element(json, matrix, r);
@@ -2894,41 +2875,36 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
             const gsf_json_value* value =
                 row && row->type == GSF_JSON_ARRAY && row->count == 4 ? gsf_find_json_element(json, row, c) : NULL;
             if (!value || value->type != GSF_JSON_NUMBER)
-                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a 4x4 matrix of numbers", where,
-                                (unsigned)matrix->offset);
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a 4x4 matrix of numbers",
+                                json->name, (unsigned)matrix->offset);
             rows[4 * r + c] = value->number;
         }
     }
-    GSF__TRY(
-        gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
-    gsf__sfm_image* image = &m->images[m->image_count];
-    if (!gsf__pose_from_opengl(rows, image->w2c))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a rotation and translation", where,
+    gsf__sfm_image image;
+    if (!gsf__pose_from_opengl(rows, image.w2c))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a rotation and translation", json->name,
                         (unsigned)matrix->offset);
-    image->name = path->string;
-    image->name_size = path->string_size;
-    while (image->name_size > 2 && image->name[0] == '.' && image->name[1] == '/')
-        image->name += 2, image->name_size -= 2;
-    image->id = (uint32_t)m->image_count + 1;
-    image->camera = camera;
-    image->camera_id = (uint32_t)camera;
-    image->at = path->offset;
-    m->image_count++;
-    return GSF_OK;
+    image.name = path->string;
+    image.name_size = path->string_size;
+    while (image.name_size > 2 && image.name[0] == '.' && image.name[1] == '/') image.name += 2, image.name_size -= 2;
+    image.id = (uint32_t)m->image_count + 1;
+    image.camera = camera;
+    image.camera_id = (uint32_t)camera;
+    image.at = path->offset;
+    return gsf__sfm_push_image(ctx, m, &image);
 }
 
-// The image names in *m point into `json`. *m must be destroyed even after an error.
+// The image names in *m point into `json`.
 static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, gsf__sfm* m) {
     const gsf_json_value* frames = gsf_find_json_member(json, &json->values[0], "frames");
     size_t shared = SIZE_MAX;
-    memset(m, 0, sizeof *m);
-    m->images_name = gsf__json_where(json);
+    m->images_name = json->name;
     if (!frames || frames->type != GSF_JSON_ARRAY)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: no \"frames\" array", gsf__json_where(json));
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: no \"frames\" array", json->name);
     for (uint32_t i = frames->child; i; i = json->values[i].next) {
         const gsf_json_value* frame = &json->values[i];
         if (frame->type != GSF_JSON_OBJECT)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: a frame is not an object", gsf__json_where(json),
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: a frame is not an object", json->name,
                             (unsigned)frame->offset);
         const int own = gsf__transforms_has_camera(json, frame);
         size_t camera = own ? m->camera_count : shared;
@@ -2955,8 +2931,9 @@ static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name
         int added;
         gsf__ply_position(&ply, i, xyz);
         for (int k = 0; k < 3; k++) {
-            const gsf__ply_type type = ply.type[GSF__PLY_RED + k];
-            double value = type == GSF__PLY_ABSENT ? 128.0 : gsf__ply_cell(&ply, i, GSF__PLY_RED + k);
+            const int slot = GSF__PLY_RED + k;
+            const gsf__ply_type type = ply.type[slot];
+            double value = type == GSF__PLY_ABSENT ? 128.0 : gsf__ply_cell(&ply, gsf__ply_row(&ply, i), slot);
             if (type == GSF__PLY_F32 || type == GSF__PLY_F64) value *= 255.0;
             rgb[k] = (uint8_t)(value > 0.0 ? (value < 255.0 ? value + 0.5 : 255.0) : 0.0);
         }
@@ -2994,7 +2971,7 @@ static double gsf__atan_ratio(double t) {
 static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double* u, double* v) {
     const double* k = lens->k;
     const double r2 = x * x + y * y;
-    double scale;
+    double scale = 1.0;
     switch (lens->kind) {
         case GSF__LENS_PINHOLE:
         case GSF__LENS_PANORAMA: break;
@@ -3013,9 +2990,7 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
         }
         case GSF__LENS_FOV: // k[1] = 2 tan(omega/2), k[2] = k[1]/omega, set by gsf__rectify_make
             scale = k[2] * gsf__atan_ratio(k[1] * sqrt(r2));
-            *u = x * scale;
-            *v = y * scale;
-            return;
+            break;
         case GSF__LENS_FISHEYE624: { // unlike in FISHEYE, the other terms act on the radially distorted point
             scale = gsf__atan_ratio(sqrt(r2));
             const double t2 = r2 * scale * scale;
@@ -3025,19 +3000,11 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
             *v = b + 2.0 * k[6] * a * b + k[7] * (q + 2.0 * b * b) + q * (k[10] + q * k[11]);
             return;
         }
-        case GSF__LENS_DIVISION:
-            scale = 2.0 / (1.0 + sqrt(1.0 - 4.0 * k[0] * r2));
-            *u = x * scale;
-            *v = y * scale;
-            return;
-        case GSF__LENS_EUCM:
-            scale = 1.0 / (1.0 - k[0] + k[0] * sqrt(1.0 + k[1] * r2));
-            *u = x * scale;
-            *v = y * scale;
-            return;
+        case GSF__LENS_DIVISION: scale = 2.0 / (1.0 + sqrt(1.0 - 4.0 * k[0] * r2)); break;
+        case GSF__LENS_EUCM: scale = 1.0 / (1.0 - k[0] + k[0] * sqrt(1.0 + k[1] * r2)); break;
     }
-    *u = x;
-    *v = y;
+    *u = x * scale;
+    *v = y * scale;
 }
 
 typedef struct gsf__rectify { // how a photo is resampled to a pinhole image
@@ -3168,6 +3135,17 @@ static double gsf__lens_radius_max(const gsf__lens* lens) {
     return limit;
 }
 
+// Makes the pinhole image as large as the photo, with the photo's principal point and `zoom` times its focal lengths.
+static void gsf__rectify_zoomed(gsf__rectify* r, double zoom) {
+    r->fx = r->lens.fx * zoom;
+    r->fy = r->lens.fy * zoom;
+    r->cx = r->lens.cx;
+    r->cy = r->lens.cy;
+    r->width = r->lens.width;
+    r->height = r->lens.height;
+    r->centre = 0.5;
+}
+
 // Rectifies the lenses that the parser of the GSFixer release has no sound method for (all but RATIONAL), and those for
 // which OpenCV's rectangle fails. Size, principal point and pixel aspect are those of the photo; the zoom is the
 // smallest at which no pixel falls outside the photo. Pixel centres are exact. Returns 0 when no image is left.
@@ -3180,13 +3158,7 @@ static int gsf__rectify_by_zoom(gsf__rectify* r) {
         if (gsf__rectify_fits(r, middle, radius_max)) high = middle;
         else low = middle;
     }
-    r->fx = r->lens.fx * high;
-    r->fy = r->lens.fy * high;
-    r->cx = r->lens.cx;
-    r->cy = r->lens.cy;
-    r->width = r->lens.width;
-    r->height = r->lens.height;
-    r->centre = 0.5;
+    gsf__rectify_zoomed(r, high);
     return 1;
 }
 
@@ -3200,13 +3172,7 @@ static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
         r->lens.k[2] = omega < 1e-6 ? 1.0 : r->lens.k[1] / omega;
         if (omega < 1e-6) r->lens.kind = GSF__LENS_PINHOLE;
     }
-    r->fx = lens->fx;
-    r->fy = lens->fy;
-    r->cx = lens->cx;
-    r->cy = lens->cy;
-    r->width = lens->width;
-    r->height = lens->height;
-    r->centre = 0.5;
+    gsf__rectify_zoomed(r, 1.0);
     if (r->lens.kind == GSF__LENS_PINHOLE) return 1;
     if (r->lens.kind == GSF__LENS_RATIONAL && gsf__rectify_like_opencv(r)) return 1;
     return gsf__rectify_by_zoom(r);
@@ -3313,25 +3279,27 @@ static void gsf__hush_begin(gsf_context* ctx, gsf__hush* hush) {
     memset(&ctx->logger, 0, sizeof ctx->logger);
 }
 
-// Restores the log hook. With `forget`, also restores ctx->error; otherwise logs the new error now.
-static void gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, int forget) {
+// Restores the log hook. Returns the result of what was run: a missing file sets *absent and is GSF_OK, another error is
+// logged now, and without one ctx->error is restored.
+static gsf_result gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, gsf_result result, int* absent) {
     ctx->logger = hush->logger;
-    if (forget) memcpy(ctx->error, hush->error, sizeof hush->error);
+    *absent = result == GSF_ERROR_NOT_FOUND;
+    if (*absent) result = GSF_OK;
+    if (result == GSF_OK) memcpy(ctx->error, hush->error, sizeof hush->error);
     else gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
+    return result;
 }
 
 // Reads <folder><relative>. *data is NULL if the file does not exist.
 static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_buffer* path,
                                      void** data, size_t* size) {
     gsf__hush hush;
+    int absent;
     path->size = 0;
     gsf_append_text(ctx, path, "%s%s", folder, relative);
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
-    const gsf_result result = gsf_read_file(ctx, path->data, data, size);
-    const int absent = result == GSF_ERROR_NOT_FOUND;
-    gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
-    return absent ? GSF_OK : result;
+    return gsf__hush_end(ctx, &hush, gsf_read_file(ctx, path->data, data, size), &absent);
 }
 
 // Names come from untrusted files, so they must not lead out of the folder: relative, no "..", no drive letter.
@@ -3359,13 +3327,13 @@ typedef struct gsf__photos { // location of a model's photos; a NULL pointer to 
 static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_buffer* path, int64_t* width, int64_t* height) {
     gsf__hush hush;
     int32_t channels;
+    int absent;
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
-    const gsf_result result = gsf_query_image(ctx, path->data, width, height, &channels);
-    const int absent = result == GSF_ERROR_NOT_FOUND;
-    gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
+    const gsf_result result =
+        gsf__hush_end(ctx, &hush, gsf_query_image(ctx, path->data, width, height, &channels), &absent);
     if (absent) *width = *height = 0;
-    return absent ? GSF_OK : result;
+    return result;
 }
 
 // Finds a view's photo. With a factor, looks first in <first folder>_<factor>/, under the same name or with another
@@ -3555,127 +3523,87 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
     return result;
 }
 
-static int gsf__compare_image_ids(const void* a, const void* b) {
-    const uint32_t x = ((const gsf__sfm_image*)a)->id, y = ((const gsf__sfm_image*)b)->id;
-    return (x > y) - (x < y);
-}
-
-static void gsf__sift_u32(uint32_t* v, size_t root, size_t n) {
-    for (size_t child; (child = 2 * root + 1) < n; root = child) {
-        if (child + 1 < n && v[child] < v[child + 1]) child++;
-        if (v[root] >= v[child]) return;
-        const uint32_t t = v[root];
-        v[root] = v[child];
-        v[child] = t;
-    }
-}
-
-// Sorts in place, in O(n log n) for every input. Short arrays, as most tracks are, use insertion sort.
-static void gsf__sort_u32(uint32_t* v, size_t n) {
-    if (n <= 32) {
-        for (size_t i = 1; i < n; i++) {
-            const uint32_t x = v[i];
-            size_t j = i;
-            for (; j > 0 && v[j - 1] > x; j--) v[j] = v[j - 1];
-            v[j] = x;
-        }
-        return;
-    }
-    for (size_t i = n / 2; i-- > 0;) gsf__sift_u32(v, i, n);
-    for (size_t i = n; i-- > 1;) {
-        const uint32_t t = v[0];
-        v[0] = v[i];
-        v[i] = t;
-        gsf__sift_u32(v, 0, i);
-    }
-}
-
 // Converts tracks from image ids to view indices, sorted and without duplicates. Ids of omitted images are dropped, as
 // are ids that no image has, which are also counted in a warning. Sorts m->images by id.
 static gsf_result gsf__scene_map_tracks(gsf_context* ctx, gsf__sfm* m) {
-    qsort(m->images, m->image_count, sizeof *m->images, gsf__compare_image_ids);
+    qsort(m->images, m->image_count, sizeof *m->images, gsf__compare_ids);
     for (size_t i = 1; i < m->image_count; i++)
         if (m->images[i].id == m->images[i - 1].id)
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image id %u occurs twice", m->images_name, m->images[i].at,
                             (unsigned)m->images[i].id);
-    if (m->track_count == 0) return GSF_OK;
+    gsf_scene* scene = m->scene;
+    uint32_t* views = scene->track_views;
+    if (scene->track_begin[scene->point_count] == 0) return GSF_OK;
     // Ids are usually dense, so they index a table; sparse ids use binary search.
     const uint32_t last = m->images[m->image_count - 1].id;
     uint32_t* table = NULL;
+    size_t longest = 0;
+    for (size_t p = 0; p < scene->point_count; p++) {
+        const size_t length = scene->track_begin[p + 1] - scene->track_begin[p];
+        longest = length > longest ? length : longest;
+    }
+    uint64_t* keys = (uint64_t*)gsf_alloc(ctx, longest, 2 * sizeof *keys); // of a point's views, and room to sort them
+    if (!keys) return GSF_ERROR_OUT_OF_MEMORY;
     if (last / 8 <= m->image_count) {
         table = (uint32_t*)gsf_alloc(ctx, (size_t)last + 1, sizeof *table);
-        if (!table) return GSF_ERROR_OUT_OF_MEMORY;
+        if (!table) {
+            gsf_free(ctx, keys);
+            return GSF_ERROR_OUT_OF_MEMORY;
+        }
         memset(table, 0xff, ((size_t)last + 1) * sizeof *table);
         for (size_t i = 0; i < m->image_count; i++) table[m->images[i].id] = (uint32_t)i;
     }
     size_t kept = 0, unknown = 0, begin = 0;
-    for (size_t p = 0; p < m->point_count; p++) {
-        const size_t end = m->track_begin[p + 1], first = kept;
+    for (size_t p = 0; p < scene->point_count; p++) {
+        const size_t end = scene->track_begin[p + 1];
+        size_t n = 0;
         for (size_t k = begin; k < end; k++) {
-            gsf__sfm_image wanted;
+            const uint32_t id = views[k];
             const gsf__sfm_image* image;
-            wanted.id = m->tracks[k];
-            if (table)
-                image = wanted.id <= last && table[wanted.id] != UINT32_MAX ? &m->images[table[wanted.id]] : NULL;
-            else image = (const gsf__sfm_image*)bsearch(&wanted, m->images, m->image_count, sizeof wanted,
-                                                          gsf__compare_image_ids);
+            if (table) image = id <= last && table[id] != UINT32_MAX ? &m->images[table[id]] : NULL;
+            else image = (const gsf__sfm_image*)bsearch(&id, m->images, m->image_count, sizeof *m->images,
+                                                        gsf__compare_ids);
             unknown += image == NULL;
-            if (image && image->camera != UINT32_MAX) m->tracks[kept++] = (uint32_t)image->camera;
+            if (image && image->camera != UINT32_MAX) keys[n++] = (uint64_t)image->camera << 32;
         }
-        gsf__sort_u32(m->tracks + first, kept - first);
-        size_t unique = first;
-        for (size_t k = first; k < kept; k++)
-            if (k == first || m->tracks[k] != m->tracks[unique - 1]) m->tracks[unique++] = m->tracks[k];
-        kept = unique;
+        const uint64_t* sorted = gsf__sort_keys(keys, keys + longest, n);
+        for (size_t k = 0; k < n; k++)
+            if (k == 0 || sorted[k] != sorted[k - 1]) views[kept++] = (uint32_t)(sorted[k] >> 32);
         begin = end;
-        m->track_begin[p + 1] = kept;
+        scene->track_begin[p + 1] = kept;
     }
-    m->track_count = kept;
+    gsf_free(ctx, keys);
     gsf_free(ctx, table);
     if (unknown)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu track entries name images that do not exist", m->images_name, unknown);
     return GSF_OK;
 }
 
-// Converts a model to a scene, which takes over the model's points. photos: NULL if parsed from memory.
-static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
-    memset(scene, 0, sizeof *scene);
+// Turns what has been read into a scene. photos: NULL if parsed from memory.
+static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos) {
+    gsf_scene* scene = m->scene;
     scene->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__scene_state));
-    gsf_result result = scene->state ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    if (scene->state && photos) ((gsf__scene_state*)scene->state)->no_masks = photos->no_masks;
-    if (result == GSF_OK) result = gsf__scene_make_views(ctx, m, photos, scene);
-    if (result == GSF_OK) result = gsf__scene_map_tracks(ctx, m);
-    if (result == GSF_OK) {
-        scene->point_count = m->point_count;
-        scene->points = m->points;
-        scene->colors = m->colors;
-        scene->point_ids = m->point_ids;
-        scene->track_begin = m->track_begin;
-        scene->track_views = m->tracks;
-        m->points = NULL;
-        m->colors = NULL;
-        m->point_ids = NULL;
-        m->track_begin = NULL;
-        m->tracks = NULL;
-        // Allocates empty arrays too, so that callers need no NULL checks.
-        if (!scene->points) scene->points = (double*)gsf_alloc_zeroed(ctx, 1, 3 * sizeof(double));
-        if (!scene->colors) scene->colors = (uint8_t*)gsf_alloc_zeroed(ctx, 1, 3);
-        if (!scene->point_ids) scene->point_ids = (uint64_t*)gsf_alloc_zeroed(ctx, 1, sizeof(uint64_t));
-        if (!scene->track_views) scene->track_views = (uint32_t*)gsf_alloc_zeroed(ctx, 1, sizeof(uint32_t));
-        if (!scene->track_begin) scene->track_begin = (size_t*)gsf_alloc_zeroed(ctx, 1, sizeof(size_t));
-        if (!scene->points || !scene->colors || !scene->point_ids || !scene->track_views || !scene->track_begin)
-            result = GSF_ERROR_OUT_OF_MEMORY;
-        if (scene->point_count == 0 && scene->track_begin) scene->track_begin[0] = 0;
-    }
-    for (size_t i = 0; i < scene->view_count && result == GSF_OK; i++) {
+    if (!scene->state) return GSF_ERROR_OUT_OF_MEMORY;
+    if (photos) ((gsf__scene_state*)scene->state)->no_masks = photos->no_masks;
+    GSF__TRY(gsf__scene_make_views(ctx, m, photos, scene));
+    GSF__TRY(gsf__scene_map_tracks(ctx, m));
+    for (size_t i = 0; i < scene->view_count; i++) {
         double centre[3];
         gsf_get_camera_center(&scene->views[i].camera, centre);
         for (int k = 0; k < 3; k++) scene->origin[k] += centre[k] / (double)scene->view_count;
     }
-    if (result == GSF_OK && m->dropped_points)
+    if (m->dropped_points)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu points dropped: a coordinate is NaN or infinite", m->images_name,
                 m->dropped_points);
-    if (result != GSF_OK) gsf_splat_destroy_scene(ctx, scene);
+    return GSF_OK;
+}
+
+// Builds the scene if reading succeeded, else destroys it; frees the rest of the model. Returns the first error.
+static gsf_result gsf__sfm_finish(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_result result) {
+    if (result == GSF_OK) result = gsf__scene_build(ctx, m, photos);
+    if (result != GSF_OK) gsf_splat_destroy_scene(ctx, m->scene);
+    gsf_free(ctx, m->cameras);
+    gsf_free(ctx, m->images);
     return result;
 }
 
@@ -3684,36 +3612,22 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
 GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras,
                                           const gsf_bytes* images, const gsf_bytes* points, gsf_scene* out) {
     gsf__sfm m;
-    memset(out, 0, sizeof *out);
-    gsf_result result = gsf__colmap_read(ctx, is_text, cameras, images, points, &m);
-    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, NULL, out);
-    gsf__sfm_destroy(ctx, &m);
-    return result;
+    gsf_result result = gsf__sfm_init(ctx, &m, out);
+    if (result == GSF_OK) result = gsf__colmap_read(ctx, is_text, cameras, images, points, &m);
+    return gsf__sfm_finish(ctx, &m, NULL, result);
 }
 
-GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out) {
-    gsf_json document;
-    gsf__sfm m;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf_parse_json(ctx, json->name ? json->name : "transforms.json",
-                            (const char*)(json->data ? json->data : ""), json->data ? json->size : 0, &document));
-    gsf_result result = gsf__transforms_read(ctx, &document, &m);
-    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, NULL, out);
-    gsf__sfm_destroy(ctx, &m);
-    gsf_destroy_json(ctx, &document);
-    return result;
-}
-
-// photos->folder must end with a separator. path: scratch.
-static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                       gsf__photos* photos, gsf_buffer* path, gsf_scene* out) {
-    gsf_json document;
+// photos: NULL if parsed from memory; else photos->folder must end with a separator. path: scratch.
+static gsf_result gsf__parse_transforms(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                        const gsf__photos* photos, gsf_buffer* path, gsf_scene* out) {
+    gsf_json json;
     gsf__sfm m;
     void* points = NULL;
     size_t points_size = 0;
-    GSF__TRY(gsf_parse_json(ctx, name, (const char*)data, size, &document));
-    gsf_result result = gsf__transforms_read(ctx, &document, &m);
-    const gsf_json_value* ply = gsf_find_json_member(&document, &document.values[0], "ply_file_path");
+    GSF__TRY(gsf_parse_json(ctx, name, (const char*)data, size, &json));
+    gsf_result result = gsf__sfm_init(ctx, &m, out);
+    if (result == GSF_OK) result = gsf__transforms_read(ctx, &json, &m);
+    const gsf_json_value* ply = photos ? gsf_find_json_member(&json, &json.values[0], "ply_file_path") : NULL;
     if (result == GSF_OK && ply && ply->type == GSF_JSON_STRING) {
         result = gsf__check_relative(ctx, name, ply->offset, ply->string, ply->string_size);
         path->size = 0;
@@ -3722,11 +3636,16 @@ static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const
         if (result == GSF_OK) result = gsf_read_file(ctx, path->data, &points, &points_size);
         if (result == GSF_OK) result = gsf__transforms_read_points(ctx, path->data, points, points_size, &m);
     }
-    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, photos, out);
+    result = gsf__sfm_finish(ctx, &m, photos, result);
     gsf_free(ctx, points);
-    gsf__sfm_destroy(ctx, &m);
-    gsf_destroy_json(ctx, &document);
+    gsf_destroy_json(ctx, &json);
     return result;
+}
+
+GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out) {
+    memset(out, 0, sizeof *out);
+    return gsf__parse_transforms(ctx, json->name ? json->name : "transforms.json", json->data ? json->data : "",
+                                 json->data ? json->size : 0, NULL, NULL, out);
 }
 
 // Reads the three files of the first model found. *found is 0 if there is none.
@@ -3741,7 +3660,6 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
     gsf_result result = GSF_OK;
     memset(bytes, 0, sizeof bytes);
     memset(names, 0, sizeof names);
-    memset(&m, 0, sizeof m);
     *found = 0;
     for (int i = 0; i < 6 && !*found && result == GSF_OK; i++) { // in each folder, binary before text
         const char* extension = i & 1 ? ".txt" : ".bin";
@@ -3750,6 +3668,7 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
         result = gsf__read_if_there(ctx, photos->folder, relative, path, &data[0], &bytes[0].size);
         if (result != GSF_OK || !data[0]) continue;
         *found = 1;
+        result = gsf__sfm_init(ctx, &m, out);
         for (int k = 0; k < 3 && result == GSF_OK; k++) {
             gsf_append_text(ctx, &names[k], "%s%s%s%s", photos->folder, folders[i / 2], files[k], extension);
             if (names[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -3758,9 +3677,8 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
             bytes[k].name = names[k].data;
         }
         if (result == GSF_OK) result = gsf__colmap_read(ctx, i & 1, &bytes[0], &bytes[1], &bytes[2], &m);
-        if (result == GSF_OK) result = gsf__scene_build(ctx, &m, photos, out);
+        result = gsf__sfm_finish(ctx, &m, photos, result);
     }
-    gsf__sfm_destroy(ctx, &m);
     for (int k = 0; k < 3; k++) {
         gsf_free(ctx, data[k]);
         gsf_destroy_buffer(ctx, &names[k]);
@@ -3796,7 +3714,7 @@ static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__ph
         GSF__TRY(gsf_read_file(ctx, path, json, &size));
     }
     photos->prefix = "";
-    return gsf__load_transforms(ctx, path, *json, size, photos, scratch, out);
+    return gsf__parse_transforms(ctx, path, *json, size, photos, scratch, out);
 }
 
 GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
@@ -3874,8 +3792,6 @@ static gsf_result gsf__join_weight(gsf_context* ctx, const gsf_image* rgb, const
     return GSF_OK;
 }
 
-static uint8_t gsf__byte_of(float v) { return (uint8_t)(v > 0.0f ? v < 255.0f ? v + 0.5f : 255.0f : 0.0f); }
-
 // Converts to bytes. Bicubic filters overshoot: where a weight is clamped to 255, its premultiplied colours are scaled
 // with it.
 static gsf_result gsf__joint_bytes(gsf_context* ctx, gsf_image* joint) {
@@ -3885,7 +3801,7 @@ static gsf_result gsf__joint_bytes(gsf_context* ctx, gsf_image* joint) {
     for (size_t i = 0; i < 4 * (size_t)joint->width * (size_t)joint->height; i += 4)
         for (size_t k = 0; k < 4; k++)
             ((uint8_t*)bytes.data)[i + k] =
-                gsf__byte_of(from[i + 3] > 255.0f ? from[i + k] * (255.0f / from[i + 3]) : from[i + k]);
+                gsf__to_u8(from[i + 3] > 255.0f ? from[i + k] * (255.0f / from[i + 3]) : from[i + k]);
     gsf_destroy_image(ctx, joint);
     *joint = bytes;
     return GSF_OK;
@@ -3898,7 +3814,7 @@ static gsf_result gsf__part_weight(gsf_context* ctx, const gsf_image* joint, gsf
     for (size_t i = 0; i < (size_t)joint->width * (size_t)joint->height; i++) {
         const uint8_t w = from[4 * i + 3];
         for (size_t k = 0; k < 3 && w > 0; k++)
-            ((uint8_t*)rgb->data)[3 * i + k] = gsf__byte_of(255.0f * from[4 * i + k] / w);
+            ((uint8_t*)rgb->data)[3 * i + k] = gsf__to_u8(255.0f * from[4 * i + k] / w);
         ((uint8_t*)weight->data)[i] = w;
     }
     return GSF_OK;
@@ -4090,9 +4006,9 @@ static void gsf__put_le(gsf_context* ctx, gsf_buffer* out, uint64_t value, int b
 }
 
 static void gsf__put_double(gsf_context* ctx, gsf_buffer* out, double value) {
-    uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    gsf__put_le(ctx, out, bits, 8);
+    char p[8];
+    gsf__store_f64(p, value);
+    gsf_append_bytes(ctx, out, p, sizeof p);
 }
 
 // Converts the rotation of a column-major matrix to a unit quaternion w x y z, w >= 0. Divides by the largest component
@@ -4119,9 +4035,10 @@ static int gsf__same_intrinsics(const gsf_camera* a, const gsf_camera* b) {
 }
 
 // Formats cameras.bin. camera_of: (view_count) receives the index of each view's camera. Cameras are numbered in the
-// order of their first view. Returns their number.
-static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_buffer* out) {
+// order of their first view.
+static void gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_buffer* out) {
     size_t count = 0;
+    gsf__put_le(ctx, out, 0, 8); // the count, filled in below
     for (size_t i = 0; i < scene->view_count; i++) {
         const gsf_camera* c = &scene->views[i].camera;
         camera_of[i] = (uint32_t)count;
@@ -4138,7 +4055,7 @@ static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint
         gsf__put_double(ctx, out, c->cx);
         gsf__put_double(ctx, out, c->cy);
     }
-    return count;
+    if (!out->failed) gsf__store_le(out->data, count, 8);
 }
 
 // Sorts the observations by view (counting sort). first: (view_count + 1); point_of, slot_of: (observations). The k-th
@@ -4201,22 +4118,19 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
                                          const char* folder) {
     static const char* const names[3] = {"cameras", "images", "points3D"};
     const size_t observations = scene->point_count ? scene->track_begin[scene->point_count] : 0;
-    gsf_buffer files[3], path, cameras;
+    gsf_buffer files[3], path;
     memset(files, 0, sizeof files);
     memset(&path, 0, sizeof path);
-    memset(&cameras, 0, sizeof cameras);
     uint32_t* camera_of = (uint32_t*)gsf_alloc(ctx, scene->view_count + 1, sizeof *camera_of);
     size_t* first = (size_t*)gsf_alloc(ctx, scene->view_count + 1, sizeof *first);
     size_t* point_of = (size_t*)gsf_alloc(ctx, observations + 1, sizeof *point_of);
     uint32_t* slot_of = (uint32_t*)gsf_alloc(ctx, observations + 1, sizeof *slot_of);
     gsf_result result = camera_of && first && point_of && slot_of ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
-        gsf__put_le(ctx, &files[0], gsf__format_cameras(ctx, scene, camera_of, &cameras), 8);
-        gsf_append_bytes(ctx, &files[0], cameras.data ? cameras.data : "", cameras.size);
+        gsf__format_cameras(ctx, scene, camera_of, &files[0]);
         gsf__sort_observations(scene, keep, first, point_of, slot_of);
         gsf__format_images(ctx, scene, camera_of, first, point_of, &files[1]);
         gsf__format_points(ctx, scene, keep, slot_of, &files[2]);
-        if (cameras.failed) result = GSF_ERROR_OUT_OF_MEMORY;
     }
     for (int k = 0; k < 3; k++)
         if (files[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -4227,7 +4141,6 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
     }
     for (int k = 0; k < 3; k++) gsf_destroy_buffer(ctx, &files[k]);
     gsf_destroy_buffer(ctx, &path);
-    gsf_destroy_buffer(ctx, &cameras);
     gsf_free(ctx, camera_of);
     gsf_free(ctx, first);
     gsf_free(ctx, point_of);

@@ -701,7 +701,7 @@ static void test_lenses(void) {
         if (!CHECK(least > (r.lens.kind == GSF__LENS_RATIONAL ? -0.5 : -0.01) && least < 0.5))
             fprintf(stderr, "  model %d: distance to the photo's border %g\n", model, least);
         if (model < 2) CHECK(r.fx == params[model][0] && r.width == 100);
-        gsf__sfm_destroy(&ctx, &m);
+        gsf_free(&ctx, m.cameras);
     }
     for (double t = 0; t < 20; t += 0.0137) CHECK_NEAR(gsf__atan_ratio(t), t > 0 ? atan(t) / t : 1.0, 1e-12);
     CHECK(count.live == 0);
