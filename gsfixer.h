@@ -90,7 +90,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define GSF_VERSION "0.1.0"
+#define GSF_VERSION "0.2.0"
 
 #ifndef GSF_API
 #if defined(GSFIXER_STATIC) && (defined(__GNUC__) || defined(__clang__))
