@@ -7335,12 +7335,6 @@ typedef struct gsf__splat_loop { // a loop over all splats
     gsf_cpu_level level;
 } gsf__splat_loop;
 
-static gsf__splat_loop gsf__make_splat_loop(const gsf_context* ctx, gsf_rasterizer* r, const gsf__view* view,
-                                          const gsf_splats* splats) {
-    const gsf__splat_loop job = {r, view, splats, NULL, NULL, ctx->cpu_level};
-    return job;
-}
-
 static size_t gsf__splat_chunks(const gsf_rasterizer* r) {
     return (r->splat_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK;
 }
@@ -8461,8 +8455,7 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     GSF__TRY(gsf__reserve_frame(ctx, r));
 
     const gsf__view view = gsf__make_view(splats, camera, desc);
-    gsf__splat_loop project = gsf__make_splat_loop(ctx, r, &view, splats);
-    project.hidden = desc->hidden;
+    gsf__splat_loop project = {r, &view, splats, desc->hidden, NULL, ctx->cpu_level};
     gsf__parallel_for(ctx, gsf__splat_chunks(r), gsf__project_chunk, &project);
     GSF__TRY(gsf__bin(ctx, r, &view));
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
@@ -8619,8 +8612,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
             for (size_t t = 0; t < tiles; t++) sum += r->tile_background[3 * t + (size_t)c];
             grads->background[c] += (float)sum;
         }
-    gsf__splat_loop gather = gsf__make_splat_loop(ctx, r, &view, splats);
-    gather.grads = grads;
+    gsf__splat_loop gather = {r, &view, splats, NULL, grads, ctx->cpu_level};
     gsf__parallel_for(ctx, gsf__splat_chunks(r), gsf__gather_chunk, &gather);
     return GSF_OK;
 }

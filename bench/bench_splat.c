@@ -180,8 +180,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     gsf_render_desc desc;
     memset(&desc, 0, sizeof desc);
     const gsf__view view = gsf__make_view(&trained, &camera, &desc);
-    gsf__splat_loop project = gsf__make_splat_loop(&ctx, r, &view, &trained);
-    project.grads = &grads;
+    gsf__splat_loop project = {r, &view, &trained, NULL, &grads, ctx.cpu_level};
     gsf__raster_job raster;
     memset(&raster, 0, sizeof raster);
     raster.r = r;
