@@ -47,11 +47,12 @@
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
    WHERE TO ADD
        an activation    gsf__nn_activation in >>nn kernels; in >>nn activations the scalar gsf__nn_activation_ref, the vector
-                        gsf__v_activate (without a case it returns x) and the list in gsf__activate; its slope,
-                        gsf__nn_activation_slope in >>nn training; its name in config.json: gsf__nn_config_read_key in
-                        >>nn files, an array and a string in the same order. Linear and 8-bit layers need no change.
-                        DINOv2, BLIP-2 (encoder, Q-Former) and OPT choose theirs by config; the other networks have
-                        fixed ones. Tests: activation_of in tests/activation.h
+                        gsf__v_activate (without a case it returns x) and the list in gsf__activate; its slope in >>nn
+                        training: gsf__nn_activation_slope, gsf__v_slope (without a case it returns 1) and the list in
+                        gsf__activate_grad; its name in config.json: gsf__nn_config_read_key in >>nn files, an array and
+                        a string in the same order. Linear and 8-bit layers need no change. DINOv2, BLIP-2 (encoder,
+                        Q-Former) and OPT choose theirs by config; the other networks have fixed ones. Tests:
+                        GSF__NN_ACTIVATION_COUNT, beside the enum, and activation_of in tests/activation.h
        a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
                         of >>nn layers
        a solver         gsf_nn_solver, in >>nn scheduler
@@ -688,6 +689,8 @@ typedef struct gsf__nn_workspace { // scratch memory of kernels; zero-initialise
 typedef enum gsf__nn_activation {
     GSF__NN_LINEAR = 0, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU, GSF__NN_RELU, GSF__NN_QUICK_GELU,
 } gsf__nn_activation;
+
+enum { GSF__NN_ACTIVATION_COUNT = GSF__NN_QUICK_GELU + 1 }; // tests loop over all of them
 
 typedef struct gsf__nn_linear_desc {
     const float* x;            // (rows, in), row stride ldx

@@ -58,9 +58,9 @@
        >>adam       optimizer step; >>densify    every densify_interval steps: clone, split, prune (or MCMC)
 
    WHERE TO ADD
-       a regulariser    its weight: a field of gsf_train_desc and a row of gsf__train_fields; a default other than zero
-                        in gsf__train_desc_defaults, for few views in gsf_splat_resolve_few_view_desc. For `gsfix fix`:
-                        `settings` and --regularize in examples/gsfix_fix.c, `switches` in examples/gsfix_report.c.
+       a regulariser    its weight: a field of gsf_train_desc and a row of gsf__train_fields (raise GSF__TRAIN_FIELDS);
+                        a default other than zero: gsf__train_desc_defaults, or gsf_splat_resolve_few_view_desc for few
+                        views. In examples: `settings`, --regularize (gsfix_fix.c), `switches` (gsfix_report.c).
                         On parameters: gsf__penalty_job and gsf__penalty_chunk in >>trainer, and in gsf__trainer_update
                         the condition under which they run. With lazy_adam, they must not write gradients of SH.
                         On the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass. Terms are
@@ -73,14 +73,16 @@
                         the focal lengths, cx, cy, then those of gsf__lens.k that it names. If its formula is new, also
                         gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (unless it is a pinhole
                         with all zeros) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
-                        gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind. The list at
-                        gsf_splat_load_scene. Tests: reference_distort and test_lenses in tests/test_scene.c
+                        gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind and the names of parameters,
+                        gsf__transforms_keys. The list at gsf_splat_load_scene. Tests: reference_distort and
+                        test_lenses, which counts through the ids (17 is refused), in tests/test_scene.c
        a file format    gsf_splat_type, a reader and a writer in >>formats
        a restorer       the host's own: fill in a gsf_restorer (gsfixer.h, "restorer interface"); gsf__open_references and
                         gsf__restore_or_skip in >>fixer make the calls. A built-in one: gsf_splat_make_NAME and
-                        _destroy_NAME in a section like >>warp, and in examples/gsfix.c the help of --restorer,
-                        gsfix_check_restorer, gsfix_make_restorer and gsfix_destroy_restorer (`none` is NULL). Tests:
-                        tests/test_fixer.c, tests/test_gsfix.sh
+                        _destroy_NAME, declared under "restorers", in a section like >>warp; in examples/gsfix.c the
+                        help of --restorer, gsfix_check_restorer, gsfix_make_restorer, gsfix_destroy_restorer (`none` is
+                        NULL) and, if `gsfix restore` can lack its inputs, a check like check_warp_clip. The list in
+                        README.md. Tests: tests/test_fixer.c, tests/test_gsfix.sh
        a start          gsf_initial_kind, in >>few views
 
    ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
@@ -2304,7 +2306,7 @@ typedef struct gsf__lens_model { // COLMAP's camera models by id
     signed char slot[12]; // index into gsf__lens.k of each parameter after the principal point
 } gsf__lens_model;
 
-static const gsf__lens_model gsf__lens_models[18] = { // COLMAP 3.12 writes the first 12, 4.1 all of them
+static const gsf__lens_model gsf__lens_models[] = { // COLMAP 3.12 writes the first 12, 4.1 all of them
     {"SIMPLE_PINHOLE", 3, 1, GSF__LENS_PINHOLE, {0}},
     {"PINHOLE", 4, 2, GSF__LENS_PINHOLE, {0}},
     {"SIMPLE_RADIAL", 4, 1, GSF__LENS_RATIONAL, {0}},

@@ -4,8 +4,6 @@
 
 #include <math.h>
 
-enum { ACTIVATION_COUNT = GSF__NN_QUICK_GELU + 1 }; // tests loop over all of them
-
 static double activation_of(gsf__nn_activation activation, double x) {
     switch (activation) {
         case GSF__NN_LINEAR: return x;

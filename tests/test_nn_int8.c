@@ -106,7 +106,7 @@ static void test_definition(gsf_context* ctx) {
         while (i % 4 != 3 && block < 256 && in % (2 * block) == 0) block *= 2;
         CHECK(q.block == block && q.in == in && q.out == out);
         CHECK(q.bytes == (size_t)(gsf__round_up(out, 16) * (gsf__round_up(in, 4) + 8)));
-        l.desc.activation = (gsf__nn_activation)(i / 5 % ACTIVATION_COUNT);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % GSF__NN_ACTIVATION_COUNT);
         l.desc.bias = i % 2 ? &l.bias : NULL;
         l.desc.gate = i % 7 < 2 ? l.gate : NULL;
         l.desc.accumulate = i % 3 == 0;

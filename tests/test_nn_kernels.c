@@ -97,7 +97,7 @@ static void check_gelu(void) {
 static void check_activate(void) {
     static const size_t sizes[] = {0, 1, 7, 8, 9, 31, 70003};
     for (size_t s = 0; s < sizeof sizes / sizeof sizes[0]; s++)
-        for (int k = 0; k < ACTIVATION_COUNT; k++) {
+        for (int k = 0; k < GSF__NN_ACTIVATION_COUNT; k++) {
             const gsf__nn_activation kind = (gsf__nn_activation)k;
             const size_t n = sizes[s];
             float *x = make_floats(n, -15.0, 15.0), *y = make_floats(n + 1, 0, 1), *z = copy_floats(x, n);
@@ -111,7 +111,7 @@ static void check_activate(void) {
             free(x); free(y); free(z); free(expected);
         }
     const float x[9] = {INFINITY, -INFINITY, NAN, FLT_MAX, -FLT_MAX, 1e3f, -1e3f, 0.0f, NAN};
-    for (int k = GSF__NN_LINEAR + 1; k < ACTIVATION_COUNT; k++) {
+    for (int k = GSF__NN_LINEAR + 1; k < GSF__NN_ACTIVATION_COUNT; k++) {
         float y[9];
         gsf__nn_activate(&one, (gsf__nn_activation)k, x, 9, y);
         CHECK(y[0] == INFINITY && y[1] == 0.0f && y[2] != y[2] && y[3] == FLT_MAX && y[4] == 0.0f);

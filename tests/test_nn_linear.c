@@ -132,7 +132,7 @@ static void test_shapes(gsf_context* ctx) {
         const int64_t in = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         const int64_t out = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         layer l = make_layer(m, in, out, dtypes[i / 3 % 3], i % 4 == 3 ? 1 + (size_t)(i % 7) : 0, i % 5 == 4 ? 3 : 0);
-        l.desc.activation = (gsf__nn_activation)(i / 5 % ACTIVATION_COUNT);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % GSF__NN_ACTIVATION_COUNT);
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;

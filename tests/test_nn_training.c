@@ -254,7 +254,7 @@ int main(void) {
                 check(&ctx, NORM, rows, in, in, 0, 17);
                 check(&ctx, SOFTMAX, rows, in, in, 0, 0);
             }
-            for (int a = 0; a < ACTIVATION_COUNT; a++) check(&ctx, ACTIVATE, rows, in, in, 0, a);
+            for (int a = 0; a < GSF__NN_ACTIVATION_COUNT; a++) check(&ctx, ACTIVATE, rows, in, in, 0, a);
         }
         test_attention(&ctx, 1, 1, 1, 1, 0.0);
         test_attention(&ctx, 7, 7, 3, 5, 0.0);
