@@ -173,13 +173,13 @@ static void add_wall(world* s, float length, float height, material m, uint32_t 
 
 // A room around the origin with half sides X and Y; `windows` are those of its four walls.
 enum { NORTH, EAST, SOUTH, WEST };
-typedef struct room {
+typedef struct room_plan {
     float x, y, height;
     material floor, walls, ceiling;
     uint32_t seed;
-} room;
+} room_plan;
 
-static place wall_of(const room* r, int side) {
+static place wall_of(const room_plan* r, int side) {
     switch (side) {
         case NORTH: return place_at(-r->x, r->y, 0, 0);
         case EAST: return place_at(r->x, r->y, 0, -0.5f * half_turn);
@@ -187,9 +187,9 @@ static place wall_of(const room* r, int side) {
         default: return place_at(-r->x, -r->y, 0, 0.5f * half_turn);
     }
 }
-static float wall_length(const room* r, int side) { return 2.0f * (side == NORTH || side == SOUTH ? r->x : r->y); }
+static float wall_length(const room_plan* r, int side) { return 2.0f * (side == NORTH || side == SOUTH ? r->x : r->y); }
 
-static void add_room(world* s, const room* r, const opening* windows[4], const int counts[4]) {
+static void add_room(world* s, const room_plan* r, const opening* windows[4], const int counts[4]) {
     const place here = place_at(0, 0, 0, 0);
     add_sheet(s, v(-r->x, -r->y, 0), v(2 * r->x, 0, 0), v(0, 2 * r->y, 0), 0.18f, r->floor, r->seed + 3u, here);
     add_sheet(s, v(-r->x, -r->y, r->height), v(0, 2 * r->y, 0), v(2 * r->x, 0, 0), 0.25f, r->ceiling,
@@ -370,7 +370,7 @@ static void build_still_life(world* s) {
     const float length = draw(s, 1.3f, 1.7f), depth = draw(s, 0.8f, 0.95f);
     set_daylight(s, -0.6f, 0.9f);
     if (indoors) {
-        const room r = {3.1f, 3.1f, 2.8f, seed & 4u ? TILES : PARQUET, seed & 8u ? WALLPAPER : WALL, WALL, seed};
+        const room_plan r = {3.1f, 3.1f, 2.8f, seed & 4u ? TILES : PARQUET, seed & 8u ? WALLPAPER : WALL, WALL, seed};
         const opening wide[2] = {{0.8f, 2.4f, 0.8f, 2.3f}, {3.6f, 5.2f, 0.8f, 2.3f}};
         const opening* windows[4] = {NULL, wide, wide, NULL};
         const int counts[4] = {0, 2, 2, 0};
@@ -415,7 +415,7 @@ static void build_still_life(world* s) {
 
 static void build_living_room(world* s) {
     const uint32_t seed = draw_seed(s);
-    const room r = {draw(s, 2.7f, 3.3f),
+    const room_plan r = {draw(s, 2.7f, 3.3f),
                     draw(s, 2.4f, 2.9f),
                     draw(s, 2.5f, 2.9f),
                     PARQUET,
@@ -471,7 +471,7 @@ static void build_living_room(world* s) {
 
 static void build_corridor(world* s) {
     const uint32_t seed = draw_seed(s);
-    const room r = {draw(s, 1.05f, 1.4f),
+    const room_plan r = {draw(s, 1.05f, 1.4f),
                     7.0f,
                     draw(s, 2.4f, 2.9f),
                     seed & 1u ? TILES : PARQUET,
@@ -542,7 +542,7 @@ static void build_bookshelf(world* s) {
     const uint32_t seed = draw_seed(s);
     const float width = draw(s, 2.3f, 2.9f), step = 0.36f;
     const int columns = 3, rows = 6;
-    const room r = {2.7f, 2.4f, 2.7f, seed & 2u ? PARQUET : TILES, seed & 1u ? WALLPAPER : WALL, WALL, seed};
+    const room_plan r = {2.7f, 2.4f, 2.7f, seed & 2u ? PARQUET : TILES, seed & 1u ? WALLPAPER : WALL, WALL, seed};
     const opening side[1] = {{1.3f, 3.3f, 0.6f, 2.3f}};
     const opening* windows[4] = {NULL, side, NULL, NULL};
     const int counts[4] = {0, 1, 0, 0};
@@ -781,7 +781,7 @@ static void build_monument(world* s) {
 
 static void build_kitchen(world* s) {
     const uint32_t seed = draw_seed(s);
-    const room r = {2.2f, 2.0f, 2.6f, seed & 1u ? TILES : PARQUET, WALL, WALL, seed};
+    const room_plan r = {2.2f, 2.0f, 2.6f, seed & 1u ? TILES : PARQUET, WALL, WALL, seed};
     const opening over[1] = {{1.55f, 2.85f, 1.15f, 2.15f}}, side[1] = {{1.0f, 2.4f, 0.9f, 2.2f}};
     const opening* windows[4] = {over, side, NULL, NULL};
     const int counts[4] = {1, 1, 0, 0};
@@ -853,7 +853,7 @@ static void build_kitchen(world* s) {
 static void build_gallery(world* s) {
     static const material stones[4] = {MARBLE, GRANITE, METAL, CHROME};
     const uint32_t seed = draw_seed(s);
-    const room r = {draw(s, 2.6f, 3.4f), 6.5f, 3.6f, seed & 1u ? MARBLE : PARQUET, WALL, WALL, seed & ~1u};
+    const room_plan r = {draw(s, 2.6f, 3.4f), 6.5f, 3.6f, seed & 1u ? MARBLE : PARQUET, WALL, WALL, seed & ~1u};
     const int counts[4] = {0, 0, 0, 0};
     set_daylight(s, 0.4f, 0.5f);
     set_indoors(s);
@@ -989,12 +989,12 @@ static void build_market(world* s) {
     set_orbit(s, 0.85f, v(0, 0, 1.05f), 3.3f, 1.65f, -0.5f * half_turn + draw(s, -0.15f, 0.15f));
 }
 
-typedef struct layout {
+typedef struct scene_layout {
     const char *name, *capture, *about;
     void (*build)(world*);
-} layout;
+} scene_layout;
 
-static const layout layouts[] = {
+static const scene_layout layouts[] = {
     {"courtyard", "orbit", "a laid table between brick walls, pots and rocks; the seed moves leaves and cameras only",
      build_courtyard},
     {"still_life", "orbit", "a table with small things, chairs; in a room or in a garden", build_still_life},

@@ -82,7 +82,7 @@ static look blank(float gloss) {
 static look look_paving(v3 p, float w) {
     look l = blank(0.0f);
     const float wobble = 0.25f * soft_noise(mul(p, 3.0f), 3.0f * w);
-    const cell c = voronoi(2.6f * p.x + wobble, 2.6f * p.y - wobble, 3);
+    const voronoi_cell c = voronoi(2.6f * p.x + wobble, 2.6f * p.y - wobble, 3);
     const float joint = 1.0f - step_between(0.03f, 0.11f, c.edge);
     const float grain = fbm(mul(p, 34.0f), 3, 34.0f * w),
                 blotch = fbm(add(mul(p, 5.0f), v((float)(c.id & 63u), 0, 0)), 4, 5.0f * w);
@@ -123,10 +123,10 @@ static look look_plaster(float s, float z, v3 p, float w) { // old ochre plaster
     const float stain = fbm(v(2.2f * s, 2.0f * p.x, 0.7f * z), 4, 2.2f * w), fine = fbm(mul(p, 22.0f), 3, 22.0f * w);
     l.albedo =
         mul(mix(v(0.66f, 0.50f, 0.30f), v(0.52f, 0.42f, 0.31f), stain), (0.55f + 0.6f * stain) * (0.8f + 0.4f * fine));
-    const cell crack = voronoi(2.1f * s + 0.5f * stain, 2.1f * z + 0.5f * fine, 11);
+    const voronoi_cell crack = voronoi(2.1f * s + 0.5f * stain, 2.1f * z + 0.5f * fine, 11);
     if (crack.edge < 0.02f) l.albedo = mul(l.albedo, 0.45f);
     if (fbm(add(mul(p, 1.4f), v(40, 0, 0)), 4, 1.4f * w) + 0.12f * (0.8f - z) > 0.57f) l = look_brick(s, z, p, 29, w);
-    const cell leaf = voronoi(11.0f * s, 11.0f * z, 21);
+    const voronoi_cell leaf = voronoi(11.0f * s, 11.0f * z, 21);
     const float cover = fbm(add(mul(p, 0.9f), v(7, 3, 1)), 3, 0.9f * w) + 0.06f * (z - 1.0f);
     if (cover + 0.16f * (part(leaf.id, 0) - 0.5f) > 0.55f && leaf.edge > 0.07f) {
         l.albedo = mul(mix(v(0.06f, 0.14f, 0.03f), v(0.22f, 0.30f, 0.07f), part(leaf.id, 1)), 0.5f + 1.1f * leaf.edge);
@@ -148,7 +148,7 @@ static look look_planks(v3 p, uint32_t seed, float w) { // boards along x, 13 cm
     l.albedo = mul(mix(dark, light, clampf(2.1f * grain - 0.75f + 0.45f * rings, 0, 1)), 0.65f + 0.6f * shade);
     const float gap = minf(across, 1.0f - across);
     if (gap < 0.035f) l.albedo = mul(l.albedo, 0.18f);
-    const cell knot = voronoi(2.4f * p.x + shift, 7.0f * p.y, 51);
+    const voronoi_cell knot = voronoi(2.4f * p.x + shift, 7.0f * p.y, 51);
     if (part(knot.id, 0) > 0.6f && knot.edge > 0.55f) l.albedo = mul(l.albedo, 0.35f);
     l.height = 0.002f * grain - (gap < 0.035f ? 0.004f : 0.0f);
     return l;
@@ -270,7 +270,7 @@ static look look_wall(v3 p, v3 n, uint32_t seed, float w) { // painted plaster, 
     l.albedo = mul(pale(paint_of(seed, 1), 0.45f), (0.72f + 0.5f * stain) * (0.82f + 0.36f * fine));
     if (seed & 1u && f.y < 0.9f + 0.02f * stain) // another colour below
         l.albedo = mul(pale(paint_of(seed, 2), 0.25f), (0.72f + 0.5f * stain) * (0.82f + 0.36f * fine));
-    const cell crack = voronoi(1.3f * f.x + 0.6f * stain, 1.3f * f.y + 0.4f * fine, (int32_t)(seed & 255u));
+    const voronoi_cell crack = voronoi(1.3f * f.x + 0.6f * stain, 1.3f * f.y + 0.4f * fine, (int32_t)(seed & 255u));
     if (crack.edge < 0.012f && stain > 0.5f) l.albedo = mul(l.albedo, 0.55f);
     const float peeled = fbm(add(mul(p, 2.3f), v(4, 9, (float)(seed & 15u))), 4, 2.3f * w);
     if (peeled > 0.66f) l.albedo = mul(v(0.48f, 0.45f, 0.40f), 0.6f + 0.7f * fine);
@@ -402,7 +402,7 @@ static look look_fabric(v3 p, v3 n, uint32_t seed, float w) {
             break;
         case 1: l.albedo = fx < 0.5f ? ground : fabsf(fx - 0.75f) < 0.06f ? extra : ink; break; // stripes
         case 2: { // flowers
-            const cell c = voronoi(1.2f * x, 1.2f * y, (int32_t)(seed & 63u));
+            const voronoi_cell c = voronoi(1.2f * x, 1.2f * y, (int32_t)(seed & 63u));
             const v3 petal = part(c.id, 0) > 0.5f ? ink : extra;
             l.albedo = mix(ground, petal, step_between(0.28f - soft, 0.28f + soft, c.edge));
             l.albedo = mix(l.albedo, v(0.7f, 0.6f, 0.2f), step_between(0.62f - soft, 0.62f + soft, c.edge));
@@ -448,19 +448,19 @@ static look look_ground(material m, v3 p, uint32_t seed, float w) {
                     patch = fbm(mul(p, 5.0f), 5, 5.0f * w);
         l.albedo = mul(mix(v(0.06f, 0.13f, 0.025f), v(0.27f, 0.31f, 0.09f), clampf(3.0f * patch - 1.0f, 0, 1)),
                        0.3f + 1.4f * blades);
-        const cell daisy = voronoi(3.0f * p.x, 3.0f * p.y, (int32_t)(seed & 63u));
+        const voronoi_cell daisy = voronoi(3.0f * p.x, 3.0f * p.y, (int32_t)(seed & 63u));
         if (daisy.edge > 0.75f && part(daisy.id, 1) > 0.55f)
             l.albedo = part(daisy.id, 2) > 0.4f ? v(0.8f, 0.8f, 0.75f) : v(0.75f, 0.6f, 0.05f);
         l.height = 0.02f * blades;
     } else if (m == GRAVEL) {
-        const cell c = voronoi(26.0f * p.x, 26.0f * p.y, 5);
+        const voronoi_cell c = voronoi(26.0f * p.x, 26.0f * p.y, 5);
         l.albedo = mul(mix(v(0.26f, 0.23f, 0.20f), v(0.62f, 0.57f, 0.50f), w > 0.06f ? 0.5f : part(c.id, 0)),
                        0.55f + 0.8f * fine);
         l.albedo = mul(l.albedo, w > 0.06f ? 0.8f : 0.45f + 0.8f * step_between(0.0f, 0.3f, c.edge));
         l.height = 0.012f * minf(c.edge, 0.5f);
     } else if (m == ASPHALT) {
         l.albedo = mul(v(0.11f, 0.11f, 0.115f), (0.45f + 1.1f * fine) * (0.6f + 0.8f * coarse));
-        const cell tar = voronoi(0.45f * p.x + 0.4f * coarse, 0.45f * p.y + 0.3f * fine, 9);
+        const voronoi_cell tar = voronoi(0.45f * p.x + 0.4f * coarse, 0.45f * p.y + 0.3f * fine, 9);
         if (tar.edge < 0.02f) l.albedo = v(0.025f, 0.025f, 0.025f);
         l.height = 0.004f * fine;
     } else { // CONCRETE: slabs
@@ -531,7 +531,7 @@ static look look_foliage(v3 p, uint32_t seed, float w) { // seed: species << 16 
 static look look_leaves(v3 p, v3 n, uint32_t seed, float w) { // the inside of a hedge
     look l = blank(0.0f);
     const flat f = flatten(p, n);
-    const cell c = voronoi(15.0f * f.x, 15.0f * f.y, 9);
+    const voronoi_cell c = voronoi(15.0f * f.x, 15.0f * f.y, 9);
     const look leaf = look_foliage(p, (seed & ~65535u) | (c.id & 65535u), w);
     l.albedo = mul(leaf.albedo, (0.25f + 1.3f * minf(c.edge, 0.6f)) * (0.4f + 0.9f * fbm(mul(p, 3.0f), 3, 3.0f * w)));
     l.height = 0.05f * minf(c.edge, 0.5f);
@@ -571,7 +571,7 @@ static v3 picture_at(float x, float y, float a, uint32_t seed, float w) { // lan
             if (y < ridge) c = mul(mix(pale(c1, 0.5f), c2, 0.33f * (float)k), 1.0f - 0.13f * (float)k);
         }
     } else if (seed / 4u % 3u == 1) { // coloured fields with lines
-        const cell f = voronoi(4.0f * x, 4.0f * y, (int32_t)(seed & 511u));
+        const voronoi_cell f = voronoi(4.0f * x, 4.0f * y, (int32_t)(seed & 511u));
         const v3 fields[4] = {c0, c1, pale(c2, 0.5f), c3};
         c = f.edge < 0.06f ? v(0.05f, 0.05f, 0.06f) : fields[f.id & 3u];
     } else { // discs and bars

@@ -37,12 +37,12 @@ static float fbm(v3 p, int octaves, float width) { // [0,1], mean 0.5
     return sum / total;
 }
 
-typedef struct cell { float edge; uint32_t id; } cell; // edge: distance to the cell's border; id: hash
+typedef struct voronoi_cell { float edge; uint32_t id; } voronoi_cell; // edge: distance to the cell's border; id: hash
 
-static cell voronoi(float x, float y, int32_t salt) {
+static voronoi_cell voronoi(float x, float y, int32_t salt) {
     const int32_t cx = floor_int(x), cy = floor_int(y);
     float best = 1e9f, second = 1e9f;
-    cell out = {0.0f, 0};
+    voronoi_cell out = {0.0f, 0};
     for (int32_t j = cy - 1; j <= cy + 1; j++)
         for (int32_t i = cx - 1; i <= cx + 1; i++) {
             const float dx = (float)i + 0.1f + 0.8f * random3(i, j, salt) - x;

@@ -82,10 +82,10 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-typedef struct pose { v3 eye, forward; float roll; } pose;
+typedef struct camera_pose { v3 eye, forward; float roll; } camera_pose;
 
 // A handheld camera carried around the courtyard's table: distance, height, aim and roll vary.
-static pose pose_in_courtyard(world* s, const make_scene_options* o, int view) {
+static camera_pose pose_in_courtyard(world* s, const make_scene_options* o, int view) {
     const float t = ((float)view + 0.5f) / (float)o->views - 0.5f,
                 step = (float)(o->arc * 3.14159265 / 180.0) / (float)o->views;
     const uint64_t k = 16 * (uint64_t)view;
@@ -95,7 +95,7 @@ static pose pose_in_courtyard(world* s, const make_scene_options* o, int view) {
     const v3 eye = v(distance * cosf(angle), distance * sinf(angle), height);
     const v3 aim =
         v(pick(s, 1, k + 3, -0.08f, 0.08f), pick(s, 1, k + 4, -0.08f, 0.08f), pick(s, 1, k + 5, 0.58f, 0.70f));
-    const pose p = {eye, unit(sub(aim, eye)), pick(s, 1, k + 6, -0.03f, 0.03f)};
+    const camera_pose p = {eye, unit(sub(aim, eye)), pick(s, 1, k + 6, -0.03f, 0.03f)};
     return p;
 }
 
@@ -118,12 +118,12 @@ static v3 keep_clear(const world* s, v3 at) {
     return at;
 }
 
-static pose pose_of(world* s, const make_scene_options* o, int view) {
+static camera_pose pose_of(world* s, const make_scene_options* o, int view) {
     const capture* c = &s->capture;
     const float t = ((float)view + 0.5f) / (float)o->views; // of the way
     const uint64_t k = 16 * (uint64_t)view;
     const v3 shake = v(pick(s, 1, k, -1, 1), pick(s, 1, k + 1, -1, 1), pick(s, 1, k + 2, -1, 1));
-    pose p = {c->from, v(1, 0, 0), pick(s, 1, k + 3, -0.025f, 0.025f)};
+    camera_pose p = {c->from, v(1, 0, 0), pick(s, 1, k + 3, -0.025f, 0.025f)};
     v3 aim = c->aim;
     if (c->kind == ORBIT) {
         const float angle = c->start + (float)(o->arc * 3.14159265 / 180.0) * (t - 0.5f);
@@ -161,7 +161,7 @@ static double focal_of(const world* s) { return floor(100.0 * (double)s->capture
 static gsf_camera camera_of(world* s, const make_scene_options* o, int view) {
     gsf_camera c;
     memset(&c, 0, sizeof c);
-    const pose p = s->layout == 0 ? pose_in_courtyard(s, o, view) : pose_of(s, o, view);
+    const camera_pose p = s->layout == 0 ? pose_in_courtyard(s, o, view) : pose_of(s, o, view);
     const v3 eye = p.eye, forward = p.forward, level = unit(cross(forward, v(0, 0, 1)));
     const float roll = p.roll;
     const v3 flat_down = cross(forward, level);

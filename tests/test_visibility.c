@@ -219,23 +219,23 @@ static size_t training_views(const gsf_scene* scene, size_t k, uint32_t* views) 
 // Two parallel walls in front of a camera: the first and smaller one hides the middle of the second. The track of one
 // more point proves it visible, although no ray reaches it.
 static void test_walls(void) {
-    enum { SIDE = 30, WALL = SIDE * SIDE, COUNT = 2 * WALL + 3 };
+    enum { SIDE = 30, WALL_POINTS = SIDE * SIDE, COUNT = 2 * WALL_POINTS + 3 };
     double* points = (double*)malloc(COUNT * 3 * sizeof *points);
     uint8_t* colors = (uint8_t*)calloc(COUNT, 3);
     size_t* begin = (size_t*)calloc(COUNT + 1, sizeof *begin);
     uint64_t state = 5;
     const double shift[3] = {3.2e6, -1.1e6, 250.0}; // georeferenced
-    for (size_t i = 0; i < 2 * WALL; i++) {
-        const size_t at = i % WALL;
+    for (size_t i = 0; i < 2 * WALL_POINTS; i++) {
+        const size_t at = i % WALL_POINTS;
         // the first wall covers half the width of the second
-        const double z = i < WALL ? 2.0 : 4.0, size = i < WALL ? 0.8 : 3.2;
+        const double z = i < WALL_POINTS ? 2.0 : 4.0, size = i < WALL_POINTS ? 0.8 : 3.2;
         points[3 * i] = size * ((double)(at % SIDE) / (SIDE - 1) - 0.5) + test_random_in(&state, -0.002, 0.002);
         points[3 * i + 1] = size * ((double)(at / SIDE) / (SIDE - 1) - 0.5) + test_random_in(&state, -0.002, 0.002);
         points[3 * i + 2] = z + test_random_in(&state, -0.004, 0.004);
     }
     // behind the first wall; behind the camera; outside the image
     const double others[9] = {0.0, 0.0, 3.0, 0.0, 0.0, -1.0, 9.0, 0.0, 3.0};
-    memcpy(points + 6 * WALL, others, sizeof others);
+    memcpy(points + 6 * WALL_POINTS, others, sizeof others);
     for (size_t i = 0; i < COUNT; i++)
         for (size_t k = 0; k < 3; k++) points[3 * i + k] += shift[k];
     uint32_t track[1] = {1};
@@ -264,16 +264,16 @@ static void test_walls(void) {
         gsf_visibility_stats stats;
         uint8_t* keep = visible(&scene, first, 1, GSF_VISIBILITY_RAYS, z, &stats);
         size_t near_kept = 0, hidden = 0, hidden_kept = 0, open = 0, open_kept = 0, kept = 0;
-        for (size_t i = 0; i < 2 * WALL; i++) {
+        for (size_t i = 0; i < 2 * WALL_POINTS; i++) {
             const double x = fabs(points[3 * i] - shift[0]), y = fabs(points[3 * i + 1] - shift[1]);
-            if (i < WALL) near_kept += keep[i];
+            if (i < WALL_POINTS) near_kept += keep[i];
             // the first wall's shadow on the second is 0.8 wide
             else if (fmax(x, y) < 0.7) { hidden++; hidden_kept += keep[i]; }
             else if (fmax(x, y) > 0.95) { open++; open_kept += keep[i]; }
         }
         for (size_t i = 0; i < COUNT; i++) kept += keep[i];
-        CHECK(near_kept == WALL && hidden > 100 && hidden_kept == 0 && open > 100 && open_kept == open);
-        CHECK(!keep[2 * WALL] && !keep[2 * WALL + 1] && !keep[2 * WALL + 2]);
+        CHECK(near_kept == WALL_POINTS && hidden > 100 && hidden_kept == 0 && open > 100 && open_kept == open);
+        CHECK(!keep[2 * WALL_POINTS] && !keep[2 * WALL_POINTS + 1] && !keep[2 * WALL_POINTS + 2]);
         CHECK(stats.points == COUNT && stats.kept == kept && stats.by_rays == kept && stats.by_tracks == 0);
         CHECK(stats.rays + stats.culled == COUNT && stats.culled >= 2);
 #ifdef GSF_USE_EMBREE
@@ -282,10 +282,10 @@ static void test_walls(void) {
         CHECK(stats.used_embree == 0);
 #endif
         uint8_t* again = visible(&scene, both, 2, GSF_VISIBILITY_BOTH, z, &stats);
-        CHECK(again[2 * WALL + 2] && stats.by_tracks == 1 && stats.kept == kept + 1);
+        CHECK(again[2 * WALL_POINTS + 2] && stats.by_tracks == 1 && stats.kept == kept + 1);
         free(again);
         again = visible(&scene, both, 2, GSF_VISIBILITY_TRACKS, z, &stats);
-        CHECK(stats.kept == 1 && stats.rays == 0 && again[2 * WALL + 2]);
+        CHECK(stats.kept == 1 && stats.rays == 0 && again[2 * WALL_POINTS + 2]);
         free(again);
         again = visible(&scene, NULL, 0, GSF_VISIBILITY_BOTH, z, &stats);
         CHECK(stats.kept == 0);
@@ -298,8 +298,8 @@ static void test_walls(void) {
     for (int z = 0; z < 2; z++) {
         uint8_t* keep = visible(&scene, first, 1, GSF_VISIBILITY_RAYS, z, NULL);
         size_t kept = 0;
-        for (size_t i = 0; i < WALL; i++) kept += keep[i];
-        CHECK(kept == WALL - 1 && !keep[7]);
+        for (size_t i = 0; i < WALL_POINTS; i++) kept += keep[i];
+        CHECK(kept == WALL_POINTS - 1 && !keep[7]);
         free(keep);
     }
     // One point only; bad arguments.
