@@ -17125,7 +17125,7 @@ typedef struct gsf__gather_job {
     int add;
 } gsf__gather_job;
 
-static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
+static void gsf__nn_gather_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__gather_job* job = (const gsf__gather_job*)arg;
     const gsf__nn_sparse* s = job->by;
     const int64_t begin = (int64_t)chunk * job->chunk_rows, end = gsf__least(begin + job->chunk_rows, s->rows);
@@ -17140,7 +17140,7 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
 GSF__SHARED void gsf__nn_gather(gsf_context* ctx, const gsf__nn_sparse* by, const float* x, int64_t channels, int add,
                                 float* y) {
     gsf__gather_job job = {gsf__grad_kernels_of(ctx->cpu_level), by, x, y, channels, gsf__nn_chunk_rows(4 * channels), add};
-    gsf__parallel_for(ctx, gsf__nn_chunks(by->rows, job.chunk_rows), gsf__gather_chunk, &job);
+    gsf__parallel_for(ctx, gsf__nn_chunks(by->rows, job.chunk_rows), gsf__nn_gather_chunk, &job);
 }
 
 typedef struct gsf__shuffle_job {
@@ -17181,7 +17181,7 @@ typedef struct gsf__nn_blend {
     float *dx, *dlogits;        // as x (may be NULL), as weights
 } gsf__nn_blend;
 
-static void gsf__blend_chunk(void* arg, size_t chunk, int32_t worker) {
+static void gsf__nn_blend_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__nn_blend* b = (const gsf__nn_blend*)arg;
     const int64_t n = b->candidates, c = b->channels, rows = gsf__nn_chunk_rows(n * c), begin = (int64_t)chunk * rows;
     (void)worker;
@@ -17216,7 +17216,7 @@ static void gsf__blend_grad_chunk(void* arg, size_t chunk, int32_t worker) {
 
 // y = the sum over a pixel's candidates of weight * x
 GSF__SHARED void gsf__nn_blend_forward(gsf_context* ctx, gsf__nn_blend* b) {
-    gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__blend_chunk, b);
+    gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__nn_blend_chunk, b);
 }
 GSF__SHARED void gsf__nn_blend_backward(gsf_context* ctx, gsf__nn_blend* b) {
     gsf__parallel_for(ctx, gsf__nn_chunks(b->pixels, gsf__nn_chunk_rows(b->candidates * b->channels)), gsf__blend_grad_chunk,
@@ -17302,24 +17302,24 @@ static double gsf__nn_adam_rate(const gsf__nn_adam_desc* d, int64_t step) { // s
     return lr * 0.5 * (1.0 + cos(3.141592653589793 * (double)(step - d->warmup) / (double)(d->steps - d->warmup)));
 }
 
-typedef struct gsf__adam_job {
+typedef struct gsf__nn_adam_job {
     const gsf__grad_kernels* kernels;
     const gsf__norm_kernels* norms;
     gsf__nn_params* params;
     gsf__adam_terms terms;
     int64_t part;             // values per part
     double squares[GSF__GRAD_PARTS];
-} gsf__adam_job;
+} gsf__nn_adam_job;
 
 static void gsf__adam_square_part(void* arg, size_t part, int32_t worker) {
-    gsf__adam_job* job = (gsf__adam_job*)arg;
+    gsf__nn_adam_job* job = (gsf__nn_adam_job*)arg;
     const int64_t begin = (int64_t)part * job->part, count = gsf__least(job->part, job->params->count - begin);
     (void)worker;
     job->squares[part] = job->norms->moments(job->params->grad + begin, count, 0).square;
 }
 
-static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
-    const gsf__adam_job* job = (const gsf__adam_job*)arg;
+static void gsf__nn_adam_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__nn_adam_job* job = (const gsf__nn_adam_job*)arg;
     const gsf__nn_params* p = job->params;
     const int64_t at = (int64_t)chunk * GSF__NN_CHUNK, count = gsf__least(GSF__NN_CHUNK, p->count - at);
     (void)worker;
@@ -17332,7 +17332,7 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
 GSF__SHARED gsf_result gsf__nn_step_adam(gsf_context* ctx, gsf__nn_params* params, const gsf__nn_adam_desc* d, double* norm) {
     const double beta1 = d->beta1 != 0.0 ? d->beta1 : 0.9, beta2 = d->beta2 != 0.0 ? d->beta2 : 0.999;
     const double mean = d->batches > 1 ? 1.0 / (double)d->batches : 1.0, rate = gsf__nn_adam_rate(d, params->step);
-    gsf__adam_job job;
+    gsf__nn_adam_job job;
     double square = 0.0;
     memset(&job, 0, sizeof job);
     job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
@@ -17358,7 +17358,7 @@ GSF__SHARED gsf_result gsf__nn_step_adam(gsf_context* ctx, gsf__nn_params* param
     job.terms.root = (float)(1.0 / sqrt(1.0 - pow(beta2, t)));
     job.terms.eps = (float)(d->eps != 0.0 ? d->eps : 1e-8);
     job.terms.average = (float)(1.0 - d->average);
-    gsf__parallel_for(ctx, gsf__nn_chunks(params->count, GSF__NN_CHUNK), gsf__adam_chunk, &job);
+    gsf__parallel_for(ctx, gsf__nn_chunks(params->count, GSF__NN_CHUNK), gsf__nn_adam_chunk, &job);
     return GSF_OK;
 }
 
