@@ -111,7 +111,8 @@ static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t 
         const double slope = (above - loss(&m)) / (2.0 * step);
         m.p[i] = before;
         if (kind == ACTIVATE && option == GSF__NN_RELU && fabs(before) < 2.0 * step) continue;
-        scale += slope * slope;
+        // A slope passes through zero near -0.75: a single value there would have a gradient of rounding errors only.
+        scale += kind == ACTIVATE ? (double)m.dy[i] * (double)m.dy[i] : slope * slope;
         error += (slope - (double)m.grad[i]) * (slope - (double)m.grad[i]);
     }
     error = scale > 0.0 ? sqrt(error / scale) : sqrt(error);
