@@ -9371,24 +9371,18 @@ static uint32_t gsf__count_bits(uint32_t bits) {
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_ADAM
 
-// gsf__adam_m and gsf__adam_v store moments, tiny ones as zero, and return what was stored.
-GSF__V_INLINE gsf__vf GSF__V(gsf__adam_m)(float* m, gsf__vf value, size_t n) {
-    value = gsf__v_keep(gsf__v_ge(gsf__v_abs(value), gsf__v_set(GSF__ADAM_TINY_M)), value);
-    gsf__v_store_first(m, value, n);
-    return value;
+// A moment without tiny values.
+GSF__V_INLINE gsf__vf GSF__V(gsf__adam_m)(gsf__vf m) {
+    return gsf__v_keep(gsf__v_ge(gsf__v_abs(m), gsf__v_set(GSF__ADAM_TINY_M)), m);
 }
 
-GSF__V_INLINE gsf__vf GSF__V(gsf__adam_v)(float* v, gsf__vf value, size_t n) {
-    value = gsf__v_keep(gsf__v_ge(value, gsf__v_set(GSF__ADAM_TINY_V)), value);
-    gsf__v_store_first(v, value, n);
-    return value;
-}
+GSF__V_INLINE gsf__vf GSF__V(gsf__adam_v)(gsf__vf v) { return gsf__v_keep(gsf__v_ge(v, gsf__v_set(GSF__ADAM_TINY_V)), v); }
 
-// Stores `next` where it is finite, else `old`. Returns a bit mask of the lanes where `next` is not finite.
-GSF__V_INLINE uint32_t GSF__V(gsf__adam_value)(float* value, gsf__vf old, gsf__vf next, size_t n) {
-    const gsf__vm kept = gsf__v_le(gsf__v_abs(next), gsf__v_set(FLT_MAX));
-    gsf__v_store_first(value, gsf__v_select(kept, next, old), n);
-    return gsf__vm_bits(gsf__vm_not(kept));
+// Stores `next` where it is finite, else `old`. Returns the lanes where it is finite.
+GSF__V_INLINE gsf__vm GSF__V(gsf__adam_value)(float* value, gsf__vf old, gsf__vf next, size_t n) {
+    const gsf__vm finite = gsf__v_le(gsf__v_abs(next), gsf__v_set(FLT_MAX));
+    gsf__v_store_first(value, gsf__v_select(finite, next, old), n);
+    return finite;
 }
 
 // Updates the first n lanes of one vector. Returns the number of gradients and updates discarded as non-finite.
@@ -9398,15 +9392,17 @@ GSF__V_INLINE uint32_t GSF__V(gsf__adam_vector)(float* value, float* m, float* v
     const gsf__vf old = gsf__v_load_first(value, n);
     const gsf__vm good = gsf__v_le(gsf__v_abs(g), gsf__v_set(GSF__ADAM_LARGEST));
     g = gsf__v_keep(good, g);
-    mi = GSF__V(gsf__adam_m)(m, gsf__v_madd(g - mi, gsf__v_set(0.1f), mi), n);
+    mi = GSF__V(gsf__adam_m)(gsf__v_madd(g - mi, gsf__v_set(0.1f), mi));
     vi = gsf__v_madd(g * gsf__v_set(0.001f), g, vi * gsf__v_set(0.999f));
-    vi = GSF__V(gsf__adam_v)(v, vi, n);
+    vi = GSF__V(gsf__adam_v)(vi);
     const gsf__vf root = gsf__v_madd(gsf__v_sqrt(vi), gsf__v_set(inv_correction2), gsf__v_set(GSF__ADAM_EPS));
     const gsf__vf next = gsf__v_nmadd(gsf__v_load(rates), mi / root, old);
-    const uint32_t bad_value = GSF__V(gsf__adam_value)(value, old, next, n);
+    const gsf__vm finite = GSF__V(gsf__adam_value)(value, old, next, n);
+    gsf__v_store_first(m, mi, n);
+    gsf__v_store_first(v, vi, n);
     gsf__v_store_first(grad, gsf__v_set(0.0f), n);
-    const uint32_t bad_grad = gsf__vm_bits(gsf__vm_not(good));
-    return bad_value | bad_grad ? gsf__count_bits(bad_value) + gsf__count_bits(bad_grad) : 0;
+    const uint32_t all = (1u << GSF__LANES) - 1u, good_bits = gsf__vm_bits(good), finite_bits = gsf__vm_bits(finite);
+    return (good_bits & finite_bits) == all ? 0 : gsf__count_bits(all & ~good_bits) + gsf__count_bits(all & ~finite_bits);
 }
 
 // Updates `rows` runs of n values each, which start `stride` apart. rates: `period` (a multiple of 8) step sizes,
@@ -9432,8 +9428,8 @@ GSF__V_INLINE void GSF__V(gsf__lazy_vector)(float* value, float* m, float* v, co
     const gsf__vf root = gsf__v_sqrt(vi) + gsf__v_set(rest->eps);
     const gsf__vf reach = gsf__v_load(rates) * gsf__v_set(rest->drift);
     (void)GSF__V(gsf__adam_value)(value, old, gsf__v_nmadd(reach, mi / root, old), n);
-    (void)GSF__V(gsf__adam_m)(m, mi * gsf__v_set(rest->decay1), n);
-    (void)GSF__V(gsf__adam_v)(v, vi * gsf__v_set(rest->decay2), n);
+    gsf__v_store_first(m, GSF__V(gsf__adam_m)(mi * gsf__v_set(rest->decay1)), n);
+    gsf__v_store_first(v, GSF__V(gsf__adam_v)(vi * gsf__v_set(rest->decay2)), n);
 }
 
 // Applies the steps of `rest` to a row of n values. Returns 0 and changes nothing if eps is not negligible for a value
