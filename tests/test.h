@@ -60,6 +60,9 @@ static inline void test_context_init(gsf_context* ctx) {
 }
 #endif
 
+// Where a test is repeated with the scalar kernels or under a sanitizer (GSF_TEST_FEW is set), `few` samples do.
+static inline int test_few(int all, int few) { return getenv("GSF_TEST_FEW") ? few : all; }
+
 static inline int test_report(void) {
     printf("%d checks, %d failed\n", test_checks, test_failures);
     return test_failures ? 1 : 0;

@@ -420,7 +420,7 @@ int main(void) {
     CHECK(writes == OUTPUTS && l.missing == 0 && outputs_are_whole("", 1));
     printf("%zu allocations, %zu reads, %zu writes\n", allocations, reads, writes);
     for (int repeat = 0; repeat < 2; repeat++) {
-        sweep_allocations(allocations, 1, repeat);
+        sweep_allocations(allocations, (size_t)test_few(1, 2), repeat);
         sweep_files(READ_FAILS, reads, 0, repeat);
         sweep_files(READ_NO_HANDLE, reads, 0, repeat);
         sweep_files(WRITE_FAILS, writes, 0, repeat);

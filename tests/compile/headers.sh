@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# headers.sh COMPILER STANDARD: every header alone, in every order, declared and implemented, and every configuration
+# headers.sh COMPILER STANDARD: every header alone, in every order (gcc: C, clang: C++), declared and implemented, and every configuration
 # compiles without a warning. Syntax only.
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
@@ -32,10 +32,14 @@ for header in "${headers[@]}"; do
         [ "$other" = "$header" ] || include_all "$header" "$other" | unit "$header, $other"
     done
 done
+case $compiler:$standard in # what depends on the order does so for every compiler: each language by one
+    gcc:c11 | clang:c++17) orders=$(permutations "" "${headers[@]}") ;;
+    *) orders="${headers[*]}" ;;
+esac
 while read -r order; do
     # shellcheck disable=SC2086
     { echo "#define GSFIXER_IMPLEMENTATION"; include_all $order; } | unit "implementation in order: $order"
-done < <(permutations "" "${headers[@]}")
+done <<< "$orders"
 
 whole() { echo "#define GSFIXER_IMPLEMENTATION"; include_all "${headers[@]}"; }
 whole | unit "NDEBUG" -DNDEBUG
