@@ -26,18 +26,20 @@ typedef struct option_spec {
 } option_spec;
 
 #define AT(field) offsetof(gsfix_options, field)
-#define ALL "info fix render filter path restore metrics masks"
+#define ALL "info fix render filter path restore metrics masks dataset"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks",
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset",
      "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
+    {"--views", TEXT, AT(views), 0, 0, "3,6,9", "dataset",
+     "numbers of reference views, each with splats and sequences of its own (default 3)"},
     {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
      "hold out every Nth view by name (default 8)"},
-    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks",
+    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
-    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks",
+    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset",
      "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
      "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
@@ -57,6 +59,7 @@ static const option_spec option_specs[] = {
     {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: denoising steps (default 50; with --quality fast 10)"},
     {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
      "dit: solver of the denoising steps (default ddim, as published; with --quality fast unipc)"},
+    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "dataset", "what captions.json and the manifests say (default: empty)"},
     {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore",
      "dit: scale of classifier-free guidance (default 6; 1 skips the unconditional pass and halves the work)"},
     {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore",
@@ -77,6 +80,11 @@ static const option_spec option_specs[] = {
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
      "regularisers for few views (default on); off gives plain 3DGS, or with --set mcmc=1 plain MCMC, which has\n"
      "penalties of its own"},
+    {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "dataset",
+     "regularisers for few views (default off: plain 3DGS, as in the paper)"},
+    {"--kinds", TEXT, AT(kinds), 0, 0, "LIST", "dataset",
+     "where the artifacts come from, separated by commas (default sparse): sparse, splats trained on the reference views\n"
+     "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
      "camera path of the frames to repair (default reference)"},
     {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},
@@ -84,10 +92,15 @@ static const option_spec option_specs[] = {
      "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
      "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
      "photos (dense, the default with 6 photos or more); random points (random, the default if the scene has no points)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "dataset", "training steps for the reference views (default 1200)"},
+    {"--clean-iterations", INT, AT(clean_iterations), 1, 1e7, "N", "dataset",
+     "training steps for the splats that are perturbed (default 3000)"},
+    {"--init", TEXT, AT(init), 0, 0, "tracks|embree|both|random", "dataset",
+     "initial points for the reference views (default tracks, as in the paper)"},
     {"--compare", FLAG, AT(compare), 0, 0, NULL, "fix",
      "also train the same number of steps from the same start and seed without repair, and report both runs: the\n"
      "difference is what the repair alone contributes"},
-    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix",
+    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix dataset",
      "approximations that are allowed (default balanced; exact allows none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png for each held-out view: the \"seen\" figures are measured over the white pixels (see gsfix masks)"},
@@ -97,17 +110,27 @@ static const option_spec option_specs[] = {
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
      "background colour: black (default), white, R,G,B from 0 to 1, or (fix) random, a new one in each step"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
+    {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset", "go on with what an interrupted run has left in OUT"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",
      "start over even if OUT contains a checkpoint, which is then deleted"},
+    {"--restart", FLAG, AT(restart), 0, 0, NULL, "dataset", "begin anew even if OUT contains a run's results or checkpoints"},
+    {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset",
+     "only print the names of the tasks, one per scene, that gsfix_mpi distributes"},
+    {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset", "only do this task"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times per run and after every\n"
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
+    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset",
+     "write OUT/SCENE/checkpoint every N training steps (default: once a minute)"},
     {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
      "also write OUT/splats.splat (no view-dependent colour) or OUT/splats.spz"},
-    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix",
+    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset",
      "override individual settings of the trainer and of the repair loop:"},
+    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset",
+     "frames per sequence, both references included: longer captures are thinned out evenly (default 49); the captures of\n"
+     "fewer photos are used as they are"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
     {"--path", TEXT, AT(path), 0, 0, "PATH.json", "fix render",
      "fix: repair frames at the cameras in this file, in every round, instead of on the path of --trajectory;\n"
@@ -146,12 +169,13 @@ static int run_masks(gsfix_app* app);
 
 typedef struct command_spec {
     const char *name, *usage, *summary;
-    int inputs; // positional arguments
+    int inputs; // positional arguments; negative: at least that many
     int (*run)(gsfix_app* app);
 } command_spec;
 
 static const command_spec command_specs[] = {
-    {"info", "SCENE | SPLATS.ply|.splat|.spz", "print the contents of a scene or a splat file", 1, run_info},
+    {"info", "SCENE | SPLATS.ply|.splat|.spz | MANIFEST.json",
+     "print the contents of a scene, a splat file, or a manifest of gsfix dataset, whose files are checked", 1, run_info},
     {"fix", "SCENE --out DIR", "train splats on photos, repair them, and write a report", 1, gsfix_run_fix},
     {"render", "SPLATS.ply|.splat|.spz (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
      run_render},
@@ -162,8 +186,9 @@ static const command_spec command_specs[] = {
     {"metrics", "DIR_A DIR_B", "compare images of the same name", 2, run_metrics},
     {"masks", "SCENE --model ALL.ply --out DIR", "write, for each held-out view, the pixels that some training view sees",
      1, run_masks},
-    {"dataset", "", "", 0, NULL},  // reserved: refused with "not in this version"
-    {"evaluate", "", "", 0, NULL},
+    {"dataset", "SCENE... --out DIR", "write paired sequences of artifact and clean frames, to train and judge restorers", -1,
+     gsfix_run_dataset},
+    {"evaluate", "", "", 0, NULL}, // reserved: refused with "not in this version"
 };
 enum { COMMAND_COUNT = sizeof command_specs / sizeof command_specs[0] };
 
@@ -276,9 +301,10 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
         const size_t length = strcspn(argv[i], "="); // --name value and --name=value
         const option_spec* o = NULL;
         for (int k = 0; k < OPTION_COUNT && !o; k++)
-            if (strlen(option_specs[k].name) == length && strncmp(option_specs[k].name, argv[i], length) == 0)
+            if (strlen(option_specs[k].name) == length && strncmp(option_specs[k].name, argv[i], length) == 0 &&
+                has_word(option_specs[k].commands, command->name))
                 o = &option_specs[k];
-        if (!o || !has_word(o->commands, command->name)) return gsfix_misused(app, "no option %s here", argv[i]);
+        if (!o) return gsfix_misused(app, "no option %s here", argv[i]);
         const char* value = argv[i][length] ? argv[i] + length + 1 : NULL;
         if (o->kind == FLAG && value) return gsfix_misused(app, "%s takes no value", o->name);
         if (o->kind != FLAG && !value && ++i >= argc) return gsfix_misused(app, "%s needs %s", o->name, o->value);
@@ -286,9 +312,9 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
         if (code) return code;
     }
     if (app->o.help) return 0;
-    if (app->o.input_count != command->inputs)
+    if (command->inputs < 0 ? app->o.input_count < -command->inputs : app->o.input_count != command->inputs)
         return gsfix_misused(app, "expected: gsfix %s %s", command->name, command->usage);
-    if (has_word("fix render filter path restore masks", command->name) && !app->o.out)
+    if (has_word("fix render filter path restore masks dataset", command->name) && !app->o.out)
         return gsfix_misused(app, "--out is missing");
     if (app->o.factor && app->o.max_size) return gsfix_misused(app, "--factor and --max-size exclude each other");
     if (app->o.resume && app->o.restart) return gsfix_misused(app, "--resume and --restart exclude each other");
@@ -692,7 +718,11 @@ static int run_info(gsfix_app* app) {
     const char* ending = strrchr(path, '.');
     const int is_splats = ending && !gsfix_is_folder(path) &&
                           (strcmp(ending, ".ply") == 0 || strcmp(ending, ".splat") == 0 || strcmp(ending, ".spz") == 0);
-    return (is_splats ? info_splats(app) : info_scene(app)) == GSF_OK ? 0 : gsfix_failed(app);
+    const int is_manifest = ending && strcmp(ending, ".json") == 0 && gsfix_is_manifest(path);
+    const gsf_result result = is_splats     ? info_splats(app)
+                              : is_manifest ? gsfix_info_dataset(app, path)
+                                            : info_scene(app);
+    return result == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- render ----------------------------------------------------------------------
@@ -1515,9 +1545,11 @@ int main(int argc, char** argv) {
 }
 
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
+#include "gsfix_dataset.c"
 #include "gsfix_exec.c"
 #include "gsfix_fix.c"
 #include "gsfix_out.c"
 #include "gsfix_report.c"
+#include "gsfix_tasks.c"
 #include "gsfix_util.c"
 #endif

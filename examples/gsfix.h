@@ -17,9 +17,10 @@
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
-    const char *caption, *model, *solver, *photo_masks, *background;
-    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames;
+    const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
+    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
+    int clean_iterations;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
     const char** inputs;
@@ -65,6 +66,7 @@ double gsfix_physical_memory(void);  // bytes of RAM; 0: unknown
 gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
 int gsfix_exists(const char* path);
 int gsfix_is_folder(const char* path);
+uint64_t gsfix_file_size(const char* path); // 0: there is none
 gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // creates missing parents, too
 // Sorted file names of a folder that end in one of the extensions (".png.jpg", lower case).
 gsf_result gsfix_list(gsf_context* ctx, const char* folder, const char* extensions, gsfix_names* out);
@@ -129,6 +131,10 @@ gsf_result gsfix_claim_file(gsfix_app* app, const char* path); // a new file out
 gsf_result gsfix_remove_stale(gsfix_app* app);
 gsf_result gsfix_remove_output(gsfix_app* app, const char* name); // if it exists and is ours
 int gsfix_has_output(gsfix_app* app, const char* name);           // does it exist and is it ours?
+// The same; sets size and XXH64 digest of a file that is ours.
+int gsfix_query_output(gsfix_app* app, const char* name, uint64_t* size, uint64_t* digest);
+uint64_t gsfix_digest(const void* data, size_t size); // XXH64
+int gsfix_digest_file(const char* path, uint64_t* size, uint64_t* digest); // 0: it cannot be read
 gsfix_path gsfix_absolute(const char* path); // with links resolved; empty if there is no such folder
 
 // A new folder in OUT for a restorer's job. Nothing outside it is ever emptied or removed.
@@ -164,6 +170,30 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app); // from the options, for -
 gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app); // removes the last clip's checkpoint when the run is complete
 gsf_traj_kind gsfix_path_kind(const char* name);
 
+// ---- gsfix_tasks.c: commands whose work is a list of tasks ------------------------
+/* A task has a folder of its own, OUT/NAME, with its own manifest and lock, and writes nothing else. What it writes depends
+   on the command line and the inputs only, so that any process may do it, and another one may finish what a killed one
+   began. merge_fn then writes the files in OUT itself from the tasks' folders.
+       gsfix COMMAND ...              all tasks that are not done yet, in order, then merges
+       gsfix COMMAND ... --tasks      prints their names
+       gsfix COMMAND ... --task NAME  does one, does not merge
+   gsfix_mpi distributes any command that is made like this. */
+typedef struct gsfix_tasks {
+    char** names; // file names, different from each other
+    size_t count;
+    void* user;
+    // Claims what merge_fn writes, in OUT; called before any work, so that a refusal comes early.
+    gsf_result (*claim_fn)(gsfix_app* app, void* user);
+    // With --resume: is the task complete, so that there is nothing to do? Cheap. o.out is the task's folder.
+    int (*done_fn)(gsfix_app* app, void* user, size_t task);
+    // o.out is the task's folder, which it claims and opens (gsfix_open_out) as a command does; app->json is its own object.
+    gsf_result (*run_fn)(gsfix_app* app, void* user, size_t task);
+    // o.out is OUT, claimed and open. All tasks are done.
+    gsf_result (*merge_fn)(gsfix_app* app, void* user);
+} gsfix_tasks;
+int gsfix_run_tasks(gsfix_app* app, const gsfix_tasks* tasks); // returns an exit code
+// Names for tasks from the paths of scenes: their last parts, with the part before where those are equal.
+gsf_result gsfix_name_scenes(gsfix_app* app, char*** names); // one per input; freed by gsfix_free_names
 // ---- gsfix_fix.c, gsfix_report.c -------------------------------------------------
 
 typedef struct gsfix_quality { // --quality is one of these rows
@@ -174,6 +204,15 @@ typedef struct gsfix_quality { // --quality is one of these rows
     int bf16;
 } gsfix_quality;
 const gsfix_quality* gsfix_find_quality(const char* name); // NULL: the default
+
+typedef struct gsfix_setup { // everything that determines a training
+    gsf_fix_desc fix;
+    gsf_initial_desc initial; // with its defaults filled in once the splats are made
+} gsfix_setup;
+int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup); // from the options; 0 or an exit code
+// Fails, naming the member, if `now` (a JSON object) has a member that differs from that of `was`, or that `was` lacks.
+gsf_result gsfix_compare_settings(gsf_context* ctx, const char* name, const gsf_buffer* now, const gsf_json* old,
+                                  const gsf_json_value* was);
 
 typedef struct gsfix_score { double psnr, ssim, psnr_seen, ssim_seen; } gsfix_score; // NaN: not measured
 typedef struct gsfix_curve_point { int32_t iteration; uint64_t splats; double psnr, psnr_seen; } gsfix_curve_point;
@@ -217,5 +256,48 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
 gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result);
 
 int gsfix_run_fix(gsfix_app* app);
+
+// ---- gsfix_dataset.c ---------------------------------------------------------------
+
+enum { GSFIX_ARTIFACT, GSFIX_CLEAN, GSFIX_DEPTH, GSFIX_ALPHA, GSFIX_FRAME_FILES };
+
+typedef struct gsfix_sequence_frame {
+    const char *name, *photo;             // file name without ending; the capture's name of the photo
+    const char* files[GSFIX_FRAME_FILES]; // relative to the scene's folder, inside it
+    uint64_t digests[GSFIX_FRAME_FILES];  // XXH64
+    int reference;                        // is the photo one of those that the splats were trained on?
+    double psnr;                          // of the artifact frame against the photo
+} gsfix_sequence_frame;
+
+// A manifest in SCENE/sequences/, checked: its paths do not leave the scene's folder, its first and last frame are references.
+typedef struct gsfix_sequence {
+    const char *scene, *kind, *caption, *cameras;
+    int views, index, width, height;
+    gsfix_sequence_frame* frames;
+    size_t frame_count;
+    gsf_json json; // holds the texts
+} gsfix_sequence;
+
+gsf_result gsfix_parse_sequence(gsf_context* ctx, const char* name, const char* text, size_t size, gsfix_sequence* out);
+void gsfix_free_sequence(gsf_context* ctx, gsfix_sequence* sequence);
+
+typedef struct gsfix_scene_sequence { const char* file; uint64_t digest; size_t frames; double psnr; } gsfix_scene_sequence;
+
+typedef struct gsfix_scene_manifest { // SCENE/manifest.json, checked likewise
+    const char* name;
+    const gsf_json_value* settings;
+    gsfix_scene_sequence* sequences;
+    size_t sequence_count;
+    gsf_json json;
+} gsfix_scene_manifest;
+
+gsf_result gsfix_parse_scene_manifest(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                      gsfix_scene_manifest* out);
+void gsfix_free_scene_manifest(gsf_context* ctx, gsfix_scene_manifest* manifest);
+
+int gsfix_run_dataset(gsfix_app* app);
+int gsfix_is_manifest(const char* path); // does the file begin as a manifest of this command does?
+// For `gsfix info`: the manifest of a sequence or of a scene; checks the digests of all its files.
+gsf_result gsfix_info_dataset(gsfix_app* app, const char* path);
 
 #endif

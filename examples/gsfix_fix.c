@@ -30,21 +30,16 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 
 // ---- settings --------------------------------------------------------------------
 
-typedef struct fix_setup { // everything that determines the result
-    gsf_fix_desc fix;
-    gsf_initial_desc initial; // with its defaults filled in once the splats are made
-} fix_setup;
-
 enum { SET_WHOLE, SET_REAL, SET_SWITCH, SET_COUNT }; // int32_t, float, int32_t of 0 (off) or 1 (on), size_t
 typedef struct setting { const char* name; int kind; size_t offset; double least, most; } setting;
-#define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
-#define FIX_AT(field) offsetof(fix_setup, fix.field)
-#define DENSE_AT(field) offsetof(fix_setup, initial.dense.field)
+#define TRAIN_AT(field) offsetof(gsfix_setup, fix.train.field)
+#define FIX_AT(field) offsetof(gsfix_setup, fix.field)
+#define DENSE_AT(field) offsetof(gsfix_setup, initial.dense.field)
 // Zero selects the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc; -1 is allowed where those give
 // negative values a meaning.
 static const setting settings[] = {
-    {"sh_degree", SET_WHOLE, offsetof(fix_setup, initial.sh_degree), 0, 3},
-    {"random_points", SET_WHOLE, offsetof(fix_setup, initial.random_points), 1, 1e8},
+    {"sh_degree", SET_WHOLE, offsetof(gsfix_setup, initial.sh_degree), 0, 3},
+    {"random_points", SET_WHOLE, offsetof(gsfix_setup, initial.random_points), 1, 1e8},
     {"dropout", SET_REAL, TRAIN_AT(dropout), 0, 0.99},
     {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay), 0, 1},
     {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty), -1, 1000},
@@ -102,7 +97,7 @@ void gsfix_print_settings(FILE* to) {
     }
 }
 
-static int apply_settings(gsfix_app* app, fix_setup* setup) {
+static int apply_settings(gsfix_app* app, gsfix_setup* setup) {
     for (const char* p = app->o.settings; p && *p;) {
         const size_t n = strcspn(p, ","), name = strcspn(p, "=");
         int i = 0;
@@ -127,7 +122,7 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
 
 static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
-static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit code
+int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     memset(setup, 0, sizeof *setup);
     setup->fix = gsf_splat_resolve_few_view_desc(NULL, gsfix_find_quality(app->o.quality)->work);
     setup->initial.kind = find_initial_kind(app->o.init);
@@ -157,7 +152,7 @@ const char* const gsfix_stage_names[GSFIX_STAGES] = {"init", "train", "render", 
 typedef struct fix_run {
     gsfix_app* app;
     gsf_context* ctx;
-    fix_setup setup;
+    gsfix_setup setup;
     gsf_scene scene;
     gsfix_split split;
     gsf_image* masks; // per test view, or NULL
@@ -392,7 +387,7 @@ static void write_switches(fix_run* run) {
     const gsfix_options* o = &run->app->o;
     static const char* const kinds[] = {"reference", "ellipse", "interpolate"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
-    fix_setup used = run->setup;
+    gsfix_setup used = run->setup;
     used.fix = gsf_splat_get_fixer_desc(run->fixer);
     const gsf_train_desc* train = &used.fix.train;
     gsfix_json_begin(ctx, t, NULL, '{');
@@ -555,20 +550,25 @@ static void show_json(const gsf_json_value* v, char text[128]) {
     else snprintf(text, 128, v ? "others" : "none");
 }
 
-static gsf_result compare_switches(fix_run* run, const char* name, const gsf_json* old, const gsf_json_value* was) {
-    gsf_json now;
-    gsf_result result = gsf_parse_json(run->ctx, "switches", run->switches.data, run->switches.size, &now);
+gsf_result gsfix_compare_settings(gsf_context* ctx, const char* name, const gsf_buffer* now, const gsf_json* old,
+                                  const gsf_json_value* was) {
+    gsf_json json;
+    gsf_result result = gsf_parse_json(ctx, "settings", now->data, now->size, &json);
     if (result != GSF_OK) return result;
-    for (uint32_t i = now.values[0].child; i && result == GSF_OK; i = now.values[i].next) {
-        const gsf_json_value *x = &now.values[i], *y = gsf_find_json_member(old, was, x->key);
+    for (uint32_t i = json.values[0].child; i && result == GSF_OK; i = json.values[i].next) {
+        const gsf_json_value *x = &json.values[i], *y = gsf_find_json_member(old, was, x->key);
         char mine[128], theirs[128];
-        if (same_json(&now, x, old, y)) continue;
+        if (same_json(&json, x, old, y)) continue;
         show_json(x, mine);
         show_json(y, theirs);
-        result = gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: made with %s %s, now %s", name, x->key, theirs, mine);
+        result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: made with %s %s, now %s", name, x->key, theirs, mine);
     }
-    gsf_destroy_json(run->ctx, &now);
+    gsf_destroy_json(ctx, &json);
     return result;
+}
+
+static gsf_result compare_switches(fix_run* run, const char* name, const gsf_json* old, const gsf_json_value* was) {
+    return gsfix_compare_settings(run->ctx, name, &run->switches, old, was);
 }
 
 // Checks that every file read then and now has the same content; its path does not matter.
@@ -1217,7 +1217,7 @@ int gsfix_run_fix(gsfix_app* app) {
     fix_run run = zero;
     run.app = app;
     run.ctx = &app->ctx;
-    const int code = resolve_setup(app, &run.setup);
+    const int code = gsfix_resolve_setup(app, &run.setup);
     if (code) return code;
     run.iterations = run.setup.fix.train.iterations;
     run.eval_every = app->o.eval_every ? app->o.eval_every : run.iterations / 10 > 0 ? run.iterations / 10 : 1;

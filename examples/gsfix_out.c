@@ -19,6 +19,7 @@
        OUT/.gsfix/manifest   "gsfix manifest 1", then a line per file: XXH64 of its bytes, size, command, name
        OUT/.gsfix/lock       locked by the run that is at work in OUT, as long as its process lives
        OUT/.gsfix/new        the file that is being written; renamed once it is whole
+       OUT/.gsfix/tasks      only where gsfix_mpi was at work: which tasks are done
    A file is ours as long as the manifest lists its name with its size and digest; once edited or replaced it is the user's.
    The line is written before the file is renamed into place, so that after a kill at any moment both the old and the new
    file are known. A truncated last line is ignored. Names are relative, so a copy of OUT takes its manifest along. Each run
@@ -121,7 +122,7 @@ static uint64_t xxh_end(const xxh64* x, const unsigned char* p, size_t rest) { /
     return h ^ h >> 32;
 }
 
-static uint64_t digest_bytes(const void* data, size_t size) {
+uint64_t gsfix_digest(const void* data, size_t size) {
     xxh64 x;
     xxh_begin(&x);
     xxh_blocks(&x, (const unsigned char*)data, size / 32 * 32);
@@ -221,7 +222,7 @@ static gsf_result read_hook(void* user, gsf_context* ctx, const char* path, void
     for (size_t i = 0; i < o->file_count; i++)
         if (strcmp(o->files[i], path) == 0) return GSF_OK; // an output of this run before it was interrupted
     result = gsfix_add_input(app, path);
-    if (result == GSF_OK) result = add_read(app, path, *size, digest_bytes(*data, *size));
+    if (result == GSF_OK) result = add_read(app, path, *size, gsfix_digest(*data, *size));
     if (result == GSF_OK) return GSF_OK;
     gsf_free(ctx, *data);
     *data = NULL;
@@ -229,13 +230,16 @@ static gsf_result read_hook(void* user, gsf_context* ctx, const char* path, void
     return result;
 }
 
+int gsfix_digest_file(const char* path, uint64_t* size, uint64_t* digest) {
+    const int file = path ? open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK) : -1;
+    const int readable = file >= 0 && digest_file(file, size, digest);
+    if (file >= 0) close(file);
+    return readable;
+}
+
 gsf_result gsfix_digest_input(gsfix_app* app, const char* path) {
     uint64_t size = 0, digest = 0;
-    const int file = path ? open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK) : -1;
-    if (file < 0) return GSF_OK;
-    const int readable = digest_file(file, &size, &digest);
-    close(file);
-    return readable ? add_read(app, path, size, digest) : GSF_OK;
+    return gsfix_digest_file(path, &size, &digest) ? add_read(app, path, size, digest) : GSF_OK;
 }
 
 const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count) {
@@ -382,6 +386,11 @@ static gsf_result parse_manifest(gsf_context* ctx, gsfix_out* o, const char* tex
         if (sscanf(line.s, "%16llx %llu %15s %n", &digest, &bytes, command, &at) != 3 || !at || !line.s[at]) continue;
         const out_line fresh = {take_name(ctx, line.s + at, strlen(line.s + at)),
                                 gsfix_copy_text(ctx, command, strlen(command)), bytes, digest, 0, {0, 0}, {0, 0}};
+        if (fresh.name && fresh.command && !*fresh.name) { // an escaped zero
+            gsf_free(ctx, fresh.name);
+            gsf_free(ctx, fresh.command);
+            continue;
+        }
         result = add_line(ctx, o, &fresh);
     }
     return result;
@@ -639,7 +648,7 @@ static gsf_result check_own(gsfix_app* app) {
     gsf_result result = GSF_OK;
     for (struct dirent* entry; list && result == GSF_OK && (entry = readdir(list)) != NULL;)
         if (strcmp(entry->d_name, ".") && strcmp(entry->d_name, "..") && strcmp(entry->d_name, "lock") &&
-            strcmp(entry->d_name, "new"))
+            strcmp(entry->d_name, "new") && strcmp(entry->d_name, "tasks"))
             result = gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/.gsfix/%s: not written by gsfix (choose another --out)", app->o.out,
                               entry->d_name);
     if (list) closedir(list);
@@ -725,13 +734,21 @@ gsf_result gsfix_remove_stale(gsfix_app* app) {
     return result;
 }
 
-int gsfix_has_output(gsfix_app* app, const char* name) {
+int gsfix_query_output(gsfix_app* app, const char* name, uint64_t* size, uint64_t* digest) {
     struct stat s;
     const char* base;
+    size_t which = 0;
     const int folder = open_folder(app->out->root, name, 0, &base);
-    const int ours = folder >= 0 && look_at(app->out, folder, base, name, &s, NULL) == 1;
+    const int ours = folder >= 0 && look_at(app->out, folder, base, name, &s, &which) == 1;
     if (folder >= 0) close(folder);
+    *size = ours ? app->out->lines[which].size : 0;
+    *digest = ours ? app->out->lines[which].digest : 0;
     return ours;
+}
+
+int gsfix_has_output(gsfix_app* app, const char* name) {
+    uint64_t size, digest;
+    return gsfix_query_output(app, name, &size, &digest);
 }
 
 // ---- writing ---------------------------------------------------------------------
@@ -753,7 +770,7 @@ static gsf_result write_output(gsfix_app* app, gsf_context* ctx, const char* pat
     gsf_result result = look_at(o, folder, base, name, &s, NULL) == 0 ? not_ours(app, name) : GSF_OK;
     if (result == GSF_OK && !write_new(o->own, "new", data, size, durable)) result = unwritten(ctx, path, errno);
     if (result == GSF_OK) {
-        if (enter_line(app, name, size, digest_bytes(data, size), durable) && renameat(o->own, "new", folder, base) == 0) {
+        if (enter_line(app, name, size, gsfix_digest(data, size), durable) && renameat(o->own, "new", folder, base) == 0) {
             settle_line(&app->ctx, o, folder, base);
         } else {
             const int reason = errno;
@@ -796,7 +813,7 @@ static gsf_result write_file(gsfix_app* app, gsf_context* ctx, const char* path,
     } else if (!write_new(folder, temporary.s, data, size, 1)) {
         result = unwritten(ctx, path, errno);
     } else {
-        int ok = o->manifest < 0 || enter_line(app, name.s, size, digest_bytes(data, size), 1);
+        int ok = o->manifest < 0 || enter_line(app, name.s, size, gsfix_digest(data, size), 1);
         if (ok && there < 0) { // link() fails if the name was taken meanwhile
             ok = linkat(folder, temporary.s, folder, base, 0) == 0;
             // A file system without hard links.

@@ -70,6 +70,11 @@ int gsfix_is_folder(const char* path) {
     return stat(path, &s) == 0 && S_ISDIR(s.st_mode);
 }
 
+uint64_t gsfix_file_size(const char* path) {
+    struct stat s;
+    return path && stat(path, &s) == 0 ? (uint64_t)s.st_size : 0;
+}
+
 gsf_result gsfix_make_folder(gsf_context* ctx, const char* path) {
     gsfix_path part = gsfix_pathf("%s", path);
     for (char* p = part.s + 1;; p++) {
