@@ -41,6 +41,8 @@
                ctx->error and passed to the log hook. On error, outputs are zeroed or unchanged and nothing leaks.
    MEMORY      All memory comes from the context's allocator. The caller that makes an object destroys it with the same
                context.
+   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 17 KB; -O0: 31 KB), so threads
+               with 256 KB are enough.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
    NAMES       Functions are gsf_VERB_NOUN, in the modules gsf_traj_VERB_NOUN, gsf_splat_VERB_NOUN and gsf_nn_VERB_NOUN;
@@ -575,15 +577,21 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
 #define GSF__X86 1
 #include <immintrin.h>
+// Unoptimised, a function would keep the temporaries of all that is inlined into it: hundreds of KB of stack.
+#if defined(__OPTIMIZE__)
+#define GSF__ALWAYS_INLINE __attribute__((always_inline))
+#else
+#define GSF__ALWAYS_INLINE
+#endif
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
-#define GSF__INLINE_AVX2 __attribute__((target("avx2,fma,f16c,bmi"), always_inline)) static inline
+#define GSF__INLINE_AVX2 GSF__TARGET_AVX2 GSF__ALWAYS_INLINE static inline
 #define GSF__AVX512 "avx2,fma,f16c,bmi,avx512f,avx512bw,avx512dq,avx512vl"
 #define GSF__TARGET_AVX512 __attribute__((target(GSF__AVX512)))
-#define GSF__INLINE_AVX512 __attribute__((target(GSF__AVX512), always_inline)) static inline
+#define GSF__INLINE_AVX512 GSF__TARGET_AVX512 GSF__ALWAYS_INLINE static inline
 #define GSF__TARGET_VNNI __attribute__((target(GSF__AVX512 ",avx512vnni")))
-#define GSF__INLINE_VNNI __attribute__((target(GSF__AVX512 ",avx512vnni"), always_inline)) static inline
+#define GSF__INLINE_VNNI GSF__TARGET_VNNI GSF__ALWAYS_INLINE static inline
 #define GSF__TARGET_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16")))
-#define GSF__INLINE_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16"), always_inline)) static inline
+#define GSF__INLINE_BF16 GSF__TARGET_BF16 GSF__ALWAYS_INLINE static inline
 #else
 #define GSF__X86 0
 #endif

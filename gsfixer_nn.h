@@ -980,7 +980,7 @@ typedef struct gsf__nn_shown { char text[100]; } gsf__nn_shown;
 
 static gsf__nn_shown gsf__nn_show(const char* name) {
     gsf__nn_shown shown;
-    snprintf(shown.text, sizeof shown.text, "%s", name);
+    snprintf(shown.text, sizeof shown.text, "%.99s", name);
     for (char* c = shown.text; *c; c++)
         if (*c < 0x20 || *c > 0x7e) *c = '?';
     return shown;
@@ -1708,8 +1708,8 @@ static gsf_result gsf__pth_memory(gsf__pth* p, unsigned char opcode, int* done) 
 }
 
 static gsf_result gsf__pth_object(gsf__pth* p, unsigned char opcode) { // globals and their instances
-    const char *module, *name;
-    size_t module_size, name_size;
+    const char *module = NULL, *name = NULL;
+    size_t module_size = 0, name_size = 0;
     uint32_t a, b;
     switch (opcode) {
         case 'c':
@@ -6264,7 +6264,7 @@ static void gsf__conv_pack_quarter(void* arg, size_t chunk, int32_t worker) { //
     if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, panel);
     for (int64_t c = 0; c < in; c++)
         for (int64_t n = 0; n < n_end; n++) {
-            float values[9];
+            float values[9] = {0};
             gsf_nn_convert_tensor(layer->weight, ((first + n) * in + c) * 9, 9, values);
             for (int64_t y = 0; y < 3; y++)
                 for (int64_t x = 0; x < 3; x++) {
@@ -15581,7 +15581,7 @@ static gsf_result gsf__amt_need(gsf__nn_loader* loader, gsf__nn_layer* out, int6
 // NAME.0 and its PReLU NAME.1
 static gsf_result gsf__amt_need_prelu(gsf__nn_loader* loader, gsf__amt_conv* out, int64_t in, const char* name) {
     char conv[96];
-    snprintf(conv, sizeof conv, "%s.0", name);
+    snprintf(conv, sizeof conv, "%.93s.0", name);
     GSF__TRY(gsf__amt_need(loader, &out->conv, in, 3, conv));
     return gsf__nn_need(loader, &out->slope, 1, out->conv.weight->shape, "%s.1.weight", name);
 }

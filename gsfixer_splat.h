@@ -5898,7 +5898,7 @@ static void gsf__dense_measure_motion(gsf__dense_pixel* p, float w) {
 // Candidate planes for the pixel: the cheapest one of each of eight regions (Xu and Tao 2019), which are four V-shaped
 // ones close to the pixel and four straight ones that reach 23 pixels. All their pixels are of the other colour.
 static int gsf__dense_gather(const gsf__dense_pixel* p, gsf__dense_plane* planes) {
-    static const int8_t near_offsets[7][2] = {{0, 1}, {-1, 2}, {1, 2}, {-2, 3}, {2, 3}, {-3, 4}, {3, 4}};
+    static const int8_t near_offsets[11][2] = {{0, 1}, {-1, 2}, {1, 2}, {-2, 3}, {2, 3}, {-3, 4}, {3, 4}}; // 7 of 11
     const gsf__dense_view* view = p->view;
     const gsf__dense_plane* all = p->job->planes + view->first;
     int count = 0;
@@ -10252,7 +10252,7 @@ static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer*
 
 // Largest distance of a camera centre from their mean. `stride`: bytes from one camera to the next.
 static double gsf__camera_spread(const gsf_camera* cameras, size_t stride, size_t count) {
-    double mean[3] = {0.0, 0.0, 0.0}, first[3], largest = 0.0;
+    double mean[3] = {0.0, 0.0, 0.0}, first[3] = {0.0, 0.0, 0.0}, largest = 0.0;
     for (int pass = 0; pass < 2; pass++)
         for (size_t i = 0; i < count; i++) {
             double c[3], d2 = 0.0;
