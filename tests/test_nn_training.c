@@ -103,7 +103,8 @@ static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t 
     CHECK_OK(ctx, backward(ctx, &m));
     double scale = 0.0; // of all gradients of the layer: some are zero or nearly so
     double error = 0.0;
-    for (int64_t i = gap ? m.at[1] : 0; i < m.at[5]; i++) {
+    const int64_t count = kind == ACTIVATE ? m.at[1] : m.at[5]; // activations have no parameters
+    for (int64_t i = gap ? m.at[1] : 0; i < count; i++) {
         const double before = m.p[i], step = 1e-4;
         m.p[i] = before + step;
         const double above = loss(&m);
