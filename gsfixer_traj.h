@@ -6,8 +6,8 @@
        #include "gsfixer_traj.h"             // includes gsfixer.h, whose implementation is needed as well
 
    WHAT IT DOES NOT DO
-       It allocates no memory and reads no files. It does not avoid obstacles: a path may pass through walls. It has no
-       smoothing splines (FITPACK's s > 0): its splines interpolate their poses.
+       It allocates no memory and reads no files. It does not avoid obstacles: a path may pass through walls (only the
+       path `spread` keeps its distance from the points). It has no smoothing splines (FITPACK's s > 0): its splines interpolate their poses.
 
    CONVENTIONS (in addition to those of gsfixer.h)
        pose            camera to world, double[16], column-major, OpenCV axes: column 0 right, 1 down, 2 forward,
@@ -29,12 +29,14 @@
        int32_t* reference = malloc(layout.frame_count * sizeof *reference);
        if (gsf_traj_sample_path(&ctx, cameras, camera_count, &desc, scratch, path, reference) != GSF_OK) ...
 
-   PATHS       gsf_traj_sample_path normalises the scene, samples the path and maps it back to the world. Three kinds:
+   PATHS       gsf_traj_sample_path normalises the scene, samples the path and maps it back to the world. Four kinds:
                reference    (GSFixer) each window starts at a photo, joins the ellipse, follows it, and ends at the photo
                             nearest to the point where it leaves the ellipse. 49 = 16 + 17 + 16 frames; any other length
                             works as well.
                ellipse      around the scene, looking at the point nearest to all optical axes
                interpolate  through the cameras in the given order
+               spread       (ours) a sweep through the space around the cameras that looks where they look: for restorers
+                            that take each frame by itself. Every round has other frames
    OFFICIAL    The code of the GSFixer release has quirks. The field `official` reproduces them up to rounding; zero
                selects the corrected behaviour:
                - legs from a photo to the ellipse have u = 0, 1/16 .. 14/16, 1 and then repeat the pose; corrected: u is
@@ -109,6 +111,9 @@ typedef enum gsf_traj_kind {
     GSF_TRAJ_REFERENCE = 0, // photo -> ellipse -> nearest photo, per window
     GSF_TRAJ_ELLIPSE,       // windows are consecutive sections of the loop
     GSF_TRAJ_INTERPOLATE,   // windows are consecutive sections of a path through the cameras in their order
+    GSF_TRAJ_SPREAD,        // frames fill a box around the cameras: their own, 1.3 times as wide, but nowhere thinner than
+                            // 0.3 times its diagonal. They look where the nearest cameras look, and keep a tenth of the
+                            // scene's depth away from the points where they can. No frame is a camera's own view
 } gsf_traj_kind;
 
 typedef struct gsf_traj_path_desc {
@@ -117,9 +122,10 @@ typedef struct gsf_traj_path_desc {
     int32_t window_count;    // 0 = 7, for INTERPOLATE cameras - 1. A single window covers the whole loop or path
     int32_t ellipse_poses;   // poses of the whole loop; 0 = REFERENCE: 5/7 of the poses in all windows, so that neighbours
                              // overlap (85 for 7 windows of 49 frames); ELLIPSE: all windows together form one loop
-    int32_t round;           // repair round, from 0: determines height, tilt and phase of the ellipse
+    int32_t round;           // repair round, from 0: determines height, tilt and phase of the ellipse, frames of SPREAD
     uint64_t seed;
-    const double* points;    // (point_count,3) world points for the principal axes, borrowed; NULL = camera positions
+    const double* points;    // (point_count,3) world points for the principal axes (SPREAD: for the depth of the scene),
+                             // borrowed; NULL = camera positions
     size_t point_count;
     const double* transform; // world to normalised frame, [16], if the host has computed it from more cameras; NULL = from
                              // these cameras and points
@@ -1436,6 +1442,14 @@ static gsf_result gsf__traj_resolve_path(gsf_context* ctx, size_t cameras, const
     return GSF_OK;
 }
 
+enum { GSF__TRAJ_SAMPLE = 4096 }; // at most twice as many points, evenly spaced, stand for the cloud
+
+// Per view the depth that it looks at, then the workspace of medians of depths or of positions.
+static size_t gsf__traj_spread_scratch(size_t count) {
+    const size_t most = gsf__traj_size_max(gsf__traj_principal_axes_scratch(count), 2 * GSF__TRAJ_SAMPLE * sizeof(double));
+    return gsf__traj_size_add(gsf__traj_size_mul(count, sizeof(double)), most);
+}
+
 static gsf_traj_path_desc gsf__traj_path_desc_defaults(const gsf_traj_path_desc* desc) {
     gsf_traj_path_desc out;
     memset(&out, 0, sizeof out);
@@ -1451,7 +1465,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
                                        gsf_traj_path_info* layout) {
     memset(layout, 0, sizeof *layout);
     const gsf_traj_path_desc d = gsf__traj_path_desc_defaults(desc);
-    if (d.kind != GSF_TRAJ_REFERENCE && d.kind != GSF_TRAJ_ELLIPSE && d.kind != GSF_TRAJ_INTERPOLATE)
+    if ((int)d.kind < 0 || d.kind > GSF_TRAJ_SPREAD)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: kind is %d", (int)d.kind);
     if (d.window_length < 0 || d.window_count < 0 || d.ellipse_poses < 0 || d.round < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
@@ -1467,6 +1481,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
     size_t work = gsf__traj_size_max(gsf__traj_normalize_scratch(camera_count, d.point_count),
                                      gsf__traj_ellipse_scratch(camera_count));
     if (d.kind == GSF_TRAJ_INTERPOLATE) work = gsf__traj_slerp_path_scratch(camera_count);
+    if (d.kind == GSF_TRAJ_SPREAD) work = gsf__traj_spread_scratch(camera_count);
     const size_t poses = gsf__traj_size_add(camera_count, (size_t)out.ellipse_poses);
     out.scratch_bytes = gsf__traj_size_add(gsf__traj_size_mul(poses, 16 * sizeof(double)), work);
     if (out.scratch_bytes == SIZE_MAX || gsf__traj_size_mul(out.frame_count, sizeof(gsf_camera)) == SIZE_MAX)
@@ -1475,7 +1490,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
     return GSF_OK;
 }
 
-typedef struct gsf__traj_job { // shared by the three kinds
+typedef struct gsf__traj_job { // shared by all kinds
     gsf_context* ctx;
     gsf_traj_path_desc desc;
     gsf_traj_path_info layout;
@@ -1550,31 +1565,48 @@ static void gsf__traj_localize(gsf__traj_job* job) {
         for (int i = 0; i < 3; i++) job->views[16 * n + 12 + (size_t)i] -= job->origin[i];
 }
 
-// Mean of the points that the views (normalised, by `transform`) look at. A view looks at the median depth of the points in
-// front of it or, without any, at four times the radius of the cameras. At most 4096 evenly spaced points are used.
-static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform[16], double out[3]) {
-    double center[3], radius = 0.0;
+// Points of a job, seen from its views, which `transform` maps to from local coordinates.
+static gsf__traj_cloud gsf__traj_job_cloud(const gsf__traj_job* job, const double transform[16]) {
     gsf__traj_cloud cloud;
     gsf__traj_cloud_init(&cloud, job->desc.points, job->desc.point_count, 3);
     memcpy(cloud.origin, job->origin, sizeof cloud.origin);
     memcpy(cloud.transform, transform, sizeof cloud.transform);
+    return cloud;
+}
+
+// Median depth of the points in front of a view or, if there are none, `fallback`. work: 2 * GSF__TRAJ_SAMPLE.
+static double gsf__traj_view_depth(const gsf__traj_cloud* cloud, const double* view, double fallback, double* work) {
+    size_t before = 0;
+    for (size_t k = 0; k < cloud->count; k += cloud->count / GSF__TRAJ_SAMPLE + 1) {
+        double p[3];
+        gsf__traj_cloud_point(cloud, k, p);
+        for (int i = 0; i < 3; i++) p[i] -= view[12 + i];
+        const double depth = gsf__traj_dot(view + 8, p);
+        if (depth > 0.0) work[before++] = depth;
+    }
+    return before ? gsf__traj_median(work, before) : fallback;
+}
+
+// Largest distance of a view from the mean of their positions.
+static double gsf__traj_views_radius(const gsf__traj_job* job) {
+    double center[3], radius = 0.0;
     gsf__traj_mean_column(job->views, job->count, 3, center);
     for (size_t n = 0; n < job->count; n++) {
         const double d = gsf__traj_distance(job->views + 16 * n + 12, center);
         if (d > radius) radius = d;
     }
+    return radius;
+}
+
+// Mean of the points that the views (normalised, by `transform`) look at. A view looks at the median depth of the points in
+// front of it or, without any, at four times the radius of the cameras.
+static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform[16], double out[3]) {
+    const gsf__traj_cloud cloud = gsf__traj_job_cloud(job, transform);
+    const double radius = gsf__traj_views_radius(job);
     memset(out, 0, 3 * sizeof(double));
     for (size_t n = 0; n < job->count; n++) {
         const double* view = job->views + 16 * n;
-        size_t before = 0;
-        for (size_t k = 0; k < cloud.count; k += cloud.count / 4096 + 1) {
-            double p[3];
-            gsf__traj_cloud_point(&cloud, k, p);
-            for (int i = 0; i < 3; i++) p[i] -= view[12 + i];
-            const double depth = gsf__traj_dot(view + 8, p);
-            if (depth > 0.0) job->work[before++] = depth;
-        }
-        const double depth = before ? gsf__traj_median(job->work, before) : 4.0 * radius;
+        const double depth = gsf__traj_view_depth(&cloud, view, 4.0 * radius, job->work);
         for (int i = 0; i < 3; i++) out[i] += (view[12 + i] + depth * view[8 + i]) / (double)job->count;
     }
 }
@@ -1698,6 +1730,114 @@ static gsf_result gsf__traj_sample_interpolate(gsf__traj_job* job) {
     return GSF_OK;
 }
 
+// ---- spread ----
+
+#define GSF__TRAJ_SPREAD_REACH 1.3  // extent of the frames' box, in extents of the cameras' box
+#define GSF__TRAJ_SPREAD_LEAST 0.15 // least half extent of the frames' box, in diagonals of the cameras' box
+#define GSF__TRAJ_CLEARANCE 0.1     // distance from all points that is enough, in depths of what the nearest view looks at
+enum { GSF__TRAJ_SPREAD_TRIES = 16 };
+
+typedef struct gsf__traj_box { double center[3], axes[9], half[3], diagonal; } gsf__traj_box; // axes: rows, longest first
+
+// The box of the positions along their principal axes, widened to that of the frames. Cameras on a line are turned about it
+// so that their mean down or, if that is along the line, their mean forward direction is an axis. An axis points towards
+// the cameras' mean right, down or forward, whichever is nearest to it, so that the path turns with the scene.
+static gsf_result gsf__traj_spread_box(const gsf__traj_job* job, gsf__traj_box* out) {
+    double mean[3][3], transform[16], square = 0.0;
+    double *down = mean[1], *forward = mean[2];
+    gsf__traj_cloud positions;
+    gsf__traj_cloud_init(&positions, job->views + 12, job->count, 16);
+    for (int c = 0; c < 3; c++) gsf__traj_mean_column(job->views, job->count, c, mean[c]);
+    if (!gsf__traj_unit(down, down) || gsf__traj_cloud_axes(job->ctx, &positions, down, job->work, transform) != GSF_OK) {
+        if (!gsf__traj_unit(forward, forward))
+            return gsf_fail(job->ctx, GSF_ERROR_DEGENERATE, "path: the directions of the %zu cameras cancel", job->count);
+        GSF__TRY(gsf__traj_cloud_axes(job->ctx, &positions, forward, job->work, transform));
+    }
+    memset(out->center, 0, sizeof out->center);
+    for (int a = 0; a < 3; a++) {
+        double low = (double)INFINITY, high = -(double)INFINITY;
+        double most = 0.0;
+        for (int i = 0; i < 3; i++) out->axes[3 * a + i] = transform[4 * i + a];
+        for (int c = 0; c < 3; c++) {
+            const double along = gsf__traj_dot(out->axes + 3 * a, mean[c]);
+            if (fabs(along) > fabs(most)) most = along;
+        }
+        for (int i = 0; i < 3 && most < 0.0; i++) out->axes[3 * a + i] = -out->axes[3 * a + i];
+        for (size_t n = 0; n < job->count; n++) {
+            const double at = gsf__traj_dot(out->axes + 3 * a, job->views + 16 * n + 12);
+            low = fmin(low, at), high = fmax(high, at);
+        }
+        square += (high - low) * (high - low);
+        out->half[a] = 0.5 * GSF__TRAJ_SPREAD_REACH * (high - low);
+        for (int i = 0; i < 3; i++) out->center[i] += 0.5 * (low + high) * out->axes[3 * a + i];
+    }
+    out->diagonal = sqrt(square);
+    for (int a = 0; a < 3; a++) out->half[a] = fmax(out->half[a], GSF__TRAJ_SPREAD_LEAST * out->diagonal);
+    return GSF_OK;
+}
+
+// The pose at `position` that looks at the mean of what the views look at, weighted by inverse squared distance from
+// them. *depth: of what the nearest view looks at. Returns 0 if there is no such pose.
+static int gsf__traj_spread_pose(const gsf__traj_job* job, const double* depths, double diagonal, const double position[3],
+                                 double pose[16], double* depth) {
+    double target[3] = {0.0, 0.0, 0.0}, down[3] = {0.0, 0.0, 0.0}, total = 0.0, nearest = (double)INFINITY;
+    for (size_t n = 0; n < job->count; n++) {
+        const double *view = job->views + 16 * n, d = gsf__traj_distance(view + 12, position) / diagonal;
+        const double weight = 1.0 / (d * d + 0.0025); // within 5 % of the diagonal it no longer grows
+        if (d < nearest) nearest = d, *depth = depths[n];
+        total += weight;
+        for (int i = 0; i < 3; i++) {
+            target[i] += weight * (view[12 + i] + depths[n] * view[8 + i]);
+            down[i] += weight * view[4 + i];
+        }
+    }
+    for (int i = 0; i < 3; i++) target[i] = target[i] / total - position[i];
+    return gsf__traj_length(down) > 1e-6 * total && gsf__traj_axes(target, down, position, pose);
+}
+
+static double gsf__traj_fraction(double x) { return x - floor(x); }
+
+// Frames sweep along the longest axis of the box; their place on the others follows the R2 sequence (Roberts 2018), which
+// continues from round to round. A frame too near to a point tries other places on these axes.
+static gsf_result gsf__traj_sample_spread(gsf__traj_job* job) {
+    const double steps[2] = {0.7548776662466927, 0.5698402909980532}; // 1/g and 1/g^2, where g^3 = g + 1
+    gsf__traj_box box;
+    GSF__TRY(gsf__traj_spread_box(job, &box));
+    const gsf__traj_cloud cloud = gsf__traj_job_cloud(job, job->to_local);
+    double *depths = job->work, *work = depths + job->count;
+    for (size_t n = 0; n < job->count; n++)
+        depths[n] = gsf__traj_view_depth(&cloud, job->views + 16 * n, 4.0 * gsf__traj_views_radius(job), work);
+    const size_t frames = job->layout.frame_count;
+    for (size_t f = 0; f < frames; f++) {
+        double best = -1.0, chosen[16];
+        for (int t = 0; t < GSF__TRAJ_SPREAD_TRIES && best < 1.0; t++) {
+            const double index = (double)job->desc.round * (double)frames + (double)f;
+            double place[3], position[3], pose[16], depth = 0.0, clear = (double)INFINITY;
+            place[0] = ((double)f + 0.5) / (double)frames;
+            for (int a = 0; a < 2; a++)
+                place[1 + a] = gsf__traj_fraction(gsf_draw_uniform(job->desc.seed, 0x73707264u, (uint64_t)a) +
+                                                  index * steps[a] + t * 0.3819660112501051);
+            for (int i = 0; i < 3; i++) {
+                position[i] = box.center[i];
+                for (int a = 0; a < 3; a++) position[i] += (2.0 * place[a] - 1.0) * box.half[a] * box.axes[3 * a + i];
+            }
+            if (!gsf__traj_spread_pose(job, depths, box.diagonal, position, pose, &depth)) continue;
+            for (size_t k = 0; k < cloud.count; k += cloud.count / GSF__TRAJ_SAMPLE + 1) {
+                double p[3];
+                gsf__traj_cloud_point(&cloud, k, p);
+                clear = fmin(clear, gsf__traj_distance(p, position));
+            }
+            clear /= GSF__TRAJ_CLEARANCE * depth;
+            if (!(clear > best)) continue;
+            best = clear;
+            memcpy(chosen, pose, sizeof chosen);
+        }
+        if (best < 0.0) return gsf_fail(job->ctx, GSF_ERROR_DEGENERATE, "path: frame %zu has no direction to look in", f);
+        GSF__TRY(gsf__traj_put_pose(job, f, chosen));
+    }
+    return GSF_OK;
+}
+
 GSF_API gsf_result gsf_traj_sample_path(gsf_context* ctx, const gsf_camera* cameras, size_t camera_count,
                                         const gsf_traj_path_desc* desc, void* scratch, gsf_camera* out,
                                         int32_t* reference_index) {
@@ -1716,9 +1856,10 @@ GSF_API gsf_result gsf_traj_sample_path(gsf_context* ctx, const gsf_camera* came
     gsf_result result = gsf__traj_check_job(&job);
     if (result == GSF_OK) {
         gsf__traj_localize(&job);
-        result = job.desc.kind == GSF_TRAJ_REFERENCE ? gsf__traj_sample_reference(&job)
-                 : job.desc.kind == GSF_TRAJ_ELLIPSE ? gsf__traj_sample_ellipse(&job)
-                                                     : gsf__traj_sample_interpolate(&job);
+        result = job.desc.kind == GSF_TRAJ_REFERENCE     ? gsf__traj_sample_reference(&job)
+                 : job.desc.kind == GSF_TRAJ_ELLIPSE     ? gsf__traj_sample_ellipse(&job)
+                 : job.desc.kind == GSF_TRAJ_INTERPOLATE ? gsf__traj_sample_interpolate(&job)
+                                                         : gsf__traj_sample_spread(&job);
     }
     if (result != GSF_OK) {
         memset(out, 0, job.layout.frame_count * sizeof *out);

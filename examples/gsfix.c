@@ -85,7 +85,7 @@ static const option_spec option_specs[] = {
     {"--kinds", TEXT, AT(kinds), 0, 0, "LIST", "dataset",
      "where the artifacts come from, separated by commas (default sparse): sparse, splats trained on the reference views\n"
      "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
-    {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
+    {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate|spread", "fix",
      "camera path of the frames to repair (default reference)"},
     {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
@@ -140,7 +140,7 @@ static const option_spec option_specs[] = {
     {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also write OUT/alpha/NAME.png"},
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
      "keep the points that a training view sees by ray (embree), by track (tracks) or by either (both, the default)"},
-    {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate", "path", "kind of path (default reference)"},
+    {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate|spread", "path", "kind of path (default reference)"},
     {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "total number of cameras on the path (default 120)"},
     {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "number of clips the frames are divided into (default 1)"},
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
@@ -440,7 +440,8 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 gsf_traj_kind gsfix_path_kind(const char* name) {
     return !name || strcmp(name, "reference") == 0 ? GSF_TRAJ_REFERENCE
            : strcmp(name, "ellipse") == 0          ? GSF_TRAJ_ELLIPSE
-                                                   : GSF_TRAJ_INTERPOLATE;
+           : strcmp(name, "interpolate") == 0      ? GSF_TRAJ_INTERPOLATE
+                                                   : GSF_TRAJ_SPREAD;
 }
 
 int gsfix_check_restorer(gsfix_app* app) {

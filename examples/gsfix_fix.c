@@ -385,7 +385,7 @@ static void write_switches(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_buffer* t = &run->switches;
     const gsfix_options* o = &run->app->o;
-    static const char* const kinds[] = {"reference", "ellipse", "interpolate"};
+    static const char* const kinds[] = {"reference", "ellipse", "interpolate", "spread"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     gsfix_setup used = run->setup;
     used.fix = gsf_splat_get_fixer_desc(run->fixer);

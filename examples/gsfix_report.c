@@ -419,7 +419,7 @@ static void put_number(page* p, double x) { // integers with all digits
 static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, const char* zero, const char* unit) {
     static const char* const meanings[][3] = {
         {"init", "both", "tracks and rays"}, {"init", "embree", "rays"}, {"init", "all", "every point"},
-        {"trajectory", "reference", "photo to photo"}, {"trajectory", "interpolate", "spline"},
+        {"trajectory", "reference", "photo to photo"}, {"trajectory", "interpolate", "spline"}, {"trajectory", "spread", "all around"},
         {"init", "dense", "tracks, rays and stereo"},
     };
     put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");

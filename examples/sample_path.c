@@ -1,6 +1,6 @@
 // sample_path.c - cc -O2 -std=c11 -I. examples/sample_path.c -o sample_path -lm && ./sample_path
 // Samples a camera path through a few views and writes it as JSON (gsf_save_cameras).
-//     sample_path [--cameras CAMERAS.json] [--kind reference|ellipse|interpolate] [--windows N] [--length N]
+//     sample_path [--cameras CAMERAS.json] [--kind reference|ellipse|interpolate|spread] [--windows N] [--length N]
 //                 [--round N] [--seed N] [--official] [--out PATH.json] [x,y,z ...]
 // Cameras come from a file, or stand at the given positions and look at the origin (z is up); by default three do.
 #include <math.h>
@@ -41,6 +41,7 @@ static int parse_options(int argc, char** argv, options* o) { // 0 = bad usage
         else if (strcmp(value, "reference") == 0) o->desc.kind = GSF_TRAJ_REFERENCE;
         else if (strcmp(value, "ellipse") == 0) o->desc.kind = GSF_TRAJ_ELLIPSE;
         else if (strcmp(value, "interpolate") == 0) o->desc.kind = GSF_TRAJ_INTERPOLATE;
+        else if (strcmp(value, "spread") == 0) o->desc.kind = GSF_TRAJ_SPREAD;
         else return 0;
         if (++i == argc) return 0;
     }
@@ -111,7 +112,7 @@ static gsf_result run(gsf_context* ctx, const options* o, const gsf_camera* came
 int main(int argc, char** argv) {
     options o;
     if (!parse_options(argc, argv, &o)) {
-        fprintf(stderr, "usage: %s [--cameras FILE] [--kind reference|ellipse|interpolate] [--windows N] [--length N]\n"
+        fprintf(stderr, "usage: %s [--cameras FILE] [--kind reference|ellipse|interpolate|spread] [--windows N] [--length N]\n"
                         "       [--round N] [--seed N] [--official] [--out FILE] [x,y,z ...]\n", argv[0]);
         return 2;
     }

@@ -116,7 +116,7 @@ for init in embree tracks both all dense random; do
     expect 0 "$gsfix" fix "$scene" --out c --restart --views 3 --iterations 2 --max-size 48 --init $init --json
     holds "\"init\":\"$init\"" stdout
 done
-for trajectory in reference ellipse interpolate; do
+for trajectory in reference ellipse interpolate spread; do
     expect 0 "$gsfix" fix "$scene" --out d --restart "${small[@]}" --restorer warp --trajectory $trajectory --quality exact
 done
 expect 0 "$gsfix" path "$scene" --views 3 --max-size 48 --kind ellipse --frames 7 --out given.json

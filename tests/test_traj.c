@@ -170,7 +170,7 @@ static void test_all_sizes(void) {
             make_scene(&s, count);
             gsf_traj_path_desc desc;
             memset(&desc, 0, sizeof desc);
-            desc.kind = (gsf_traj_kind)(test_random_bits(&rng) % 3);
+            desc.kind = (gsf_traj_kind)(test_random_bits(&rng) % 4);
             desc.window_length = length;
             desc.seed = test_random_bits(&rng);
             desc.round = (int32_t)(test_random_bits(&rng) % 8);
@@ -190,7 +190,7 @@ static void test_all_sizes(void) {
             } else if (p.result == GSF_OK) {
                 for (size_t f = 0; f < p.layout.frame_count; f++) {
                     const int32_t r = p.reference[f];
-                    CHECK(desc.kind == GSF_TRAJ_ELLIPSE ? r == -1 : r >= -1 && r < (int32_t)count);
+                    CHECK(desc.kind != GSF_TRAJ_INTERPOLATE ? r == -1 : r >= -1 && r < (int32_t)count);
                     if (r >= 0) CHECK(memcmp(p.frames[f].w2c, s.cameras[r].w2c, sizeof p.frames[f].w2c) == 0);
                 }
                 if (desc.kind == GSF_TRAJ_INTERPOLATE) { // starts at the first camera and ends at the last
@@ -291,8 +291,8 @@ static void test_invariance(void) {
         make_scene(&s, 2 + (size_t)trial % 9);
         gsf_traj_path_desc desc;
         memset(&desc, 0, sizeof desc);
-        desc.kind = (gsf_traj_kind)(trial % 3);
-        desc.round = trial % 4;
+        desc.kind = (gsf_traj_kind)(trial % 4);
+        desc.round = trial % 5;
         if (trial % 2) { desc.points = s.points; desc.point_count = POINTS; }
         check_following(&s, &desc, 1e-3, none, 1e-11);
         check_following(&s, &desc, 1e3, none, 1e-11);
@@ -317,6 +317,70 @@ static void test_invariance(void) {
         memset(&desc, 0, sizeof desc);
         check_following(&s, &desc, 1e-3, none, 1e-11);
         check_following(&s, &desc, 1e3, near_by, 1e-11);
+    }
+}
+
+// ---- spread --------------------------------------------------------------------
+
+static double nearest_frame(const path* p, const double at[3]) {
+    double nearest = INFINITY;
+    for (size_t f = 0; f < p->layout.frame_count; f++) {
+        double center[3], square = 0.0;
+        gsf_get_camera_center(&p->frames[f], center);
+        for (int i = 0; i < 3; i++) square += (center[i] - at[i]) * (center[i] - at[i]);
+        nearest = fmin(nearest, sqrt(square));
+    }
+    return nearest;
+}
+
+// Frames come near every position between the cameras, look at the scene, differ from round to round, and stay away from
+// an obstacle where there is room.
+static void test_spread(void) {
+    for (int trial = 0; trial < 20; trial++) {
+        scene s;
+        make_scene(&s, 2 + (size_t)trial % 9);
+        gsf_traj_path_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.kind = GSF_TRAJ_SPREAD;
+        desc.window_length = 50;
+        desc.window_count = 3;
+        desc.seed = (uint64_t)trial;
+        path p = sample(s.cameras, s.count, &desc);
+        desc.round = 1;
+        path next = sample(s.cameras, s.count, &desc);
+        if (!CHECK_OK(&ctx, p.result) || !CHECK_OK(&ctx, next.result)) continue;
+        double diameter = 0.0, worst = 0.0, same = INFINITY, a[3], b[3];
+        for (size_t i = 0; i < s.count; i++)
+            for (size_t j = 0; j < i; j++) {
+                gsf_get_camera_center(&s.cameras[i], a);
+                gsf_get_camera_center(&s.cameras[j], b);
+                diameter = fmax(diameter, sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]) +
+                                               (a[2] - b[2]) * (a[2] - b[2])));
+            }
+        for (int k = 0; k < 50; k++) { // positions between two cameras
+            const double t = uniform(0.0, 1.0);
+            gsf_get_camera_center(&s.cameras[test_random_bits(&rng) % s.count], a);
+            gsf_get_camera_center(&s.cameras[test_random_bits(&rng) % s.count], b);
+            for (int i = 0; i < 3; i++) a[i] += t * (b[i] - a[i]);
+            worst = fmax(worst, nearest_frame(&p, a));
+        }
+        CHECK(worst < 0.3 * diameter);
+        for (size_t f = 0; f < p.layout.frame_count; f++) {
+            CHECK(p.reference[f] == -1);
+            gsf_get_camera_center(&p.frames[f], a);
+            same = fmin(same, nearest_frame(&next, a));
+        }
+        CHECK(same > 0.0);
+        drop(&next);
+        desc.round = 0;
+        double obstacle[3]; // a point where a frame was
+        gsf_get_camera_center(&p.frames[70], obstacle);
+        desc.points = obstacle;
+        desc.point_count = 1;
+        path around = sample(s.cameras, s.count, &desc);
+        if (CHECK_OK(&ctx, around.result)) CHECK(nearest_frame(&around, obstacle) > 0.0);
+        drop(&around);
+        drop(&p);
     }
 }
 
@@ -882,6 +946,7 @@ int main(void) {
     test_defaults();
     test_all_sizes();
     test_invariance();
+    test_spread();
     test_degenerate_cameras();
     test_parallel_axes();
     test_outliers();
