@@ -478,6 +478,8 @@ typedef struct gsf_train_desc {
     uint32_t _start_canary;
     int32_t iterations;            // 30000
     uint64_t seed;
+    int32_t coarse_until;          // 0; photos have half their size up to this iteration, which then takes less than half
+                                   // of the time. Photos of less than 32 pixels a side are not halved
     int32_t sh_degree;             // degree to train; 0 = the splats' own
     int32_t sh_interval;           // 1000 s: iterations per additional SH band; bands that the splats already use stay
                                    // active
@@ -495,6 +497,10 @@ typedef struct gsf_train_desc {
     float densify_grad;            // 2e-4
     int32_t densify_absolute;      // 0; 1: sum absolute gradients over the pixels (AbsGS; use densify_grad 4e-4 to 8e-4)
     float densify_scale;           // 0.01: clone below this fraction of extent, split above
+    int32_t densify_shared;        // 0; 1: new splats share the opacity of the old one, so that they are together as opaque
+                                   // as it was: 1 - sqrt(1 - opacity) each (Rota Bulo et al. 2024). A split puts two
+                                   // splats half a standard deviation to either side along the longest axis, which
+                                   // becomes 0.66 times as long. Renders change less, and there are fewer splats
     float prune_opacity;           // 0.005
     float prune_scale;             // 0.1 of extent, after the first opacity reset
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
@@ -9609,8 +9615,8 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
 // Adaptive density control of 3DGS: splats with a large mean screen-space gradient are cloned if small and split in
 // two if large (scales / 1.6, means sampled from the splat's Gaussian), then transparent and oversized splats are
 // pruned. Row order as in the Inria 3DGS code: kept originals, clones, first halves, second halves. Its pruning by
-// screen size is omitted, because it never triggers there (the radii are zeroed before the test). The alternative,
-// MCMC, follows below.
+// screen size is omitted, because it never triggers there (the radii are zeroed before the test). With `shared`, the
+// render changes less (see gsf_train_desc.densify_shared). The alternative, MCMC, follows below.
 
 typedef enum gsf__densify_action { GSF__KEEP = 0, GSF__CLONE, GSF__SPLIT } gsf__densify_action;
 
@@ -9620,6 +9626,7 @@ typedef struct gsf__densify_rule {
     double prune_opacity;  // splats with a lower opacity are removed
     double prune_scale;    // splats larger than this are removed, too; 0 = off
     size_t max_splats;
+    int shared;            // new splats share the opacity of the old one
     uint64_t seed, stream; // of the random offsets, which also depend on the splat's id
     const float* normals;  // (2, splits, 3) standard normal samples to use instead; NULL = draw them
 } gsf__densify_rule;
@@ -9634,10 +9641,14 @@ static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
     return largest;
 }
 
-static float gsf__model_max_log_scale(const gsf__model* model, size_t i) {
+static int gsf__model_longest_axis(const gsf__model* model, size_t i) {
     const float* s = model->groups[GSF__SCALES].value + 3 * i;
-    const float m = s[0] > s[1] ? s[0] : s[1];
-    return m > s[2] ? m : s[2];
+    const int longest = s[0] >= s[1] ? 0 : 1;
+    return s[longest] >= s[2] ? longest : 2;
+}
+
+static float gsf__model_max_log_scale(const gsf__model* model, size_t i) {
+    return model->groups[GSF__SCALES].value[3 * i + (size_t)gsf__model_longest_axis(model, i)];
 }
 
 static float gsf__positive_float(uint32_t bits) { // floats >= 0 are ordered like their bit patterns
@@ -9716,19 +9727,44 @@ static void gsf__densify_clear(gsf__model* model) { // resets the statistics
     for (int k = 0; k < 2; k++) memset(model->visits[k], 0, model->count * sizeof(uint32_t));
 }
 
-static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, const double normal[3]) {
-    gsf__model_copy_row(model, parent, child);
-    float* mean = model->groups[GSF__MEANS].value + 3 * child;
-    float* scale = model->groups[GSF__SCALES].value + 3 * child;
-    double r[9], offset[3];
-    gsf__densify_rotation(model->groups[GSF__QUATS].value + 4 * child, r);
-    for (int a = 0; a < 3; a++) offset[a] = exp((double)scale[a]) * normal[a];
+// Moves a splat by `offset`, given along its axes.
+static void gsf__densify_move(gsf__model* model, size_t i, const double offset[3]) {
+    float* mean = model->groups[GSF__MEANS].value + 3 * i;
+    double r[9];
+    gsf__densify_rotation(model->groups[GSF__QUATS].value + 4 * i, r);
     for (int a = 0; a < 3; a++) {
         const double moved =
             (double)mean[a] + r[3 * a] * offset[0] + r[3 * a + 1] * offset[1] + r[3 * a + 2] * offset[2];
         if (fabs(moved) <= (double)FLT_MAX) mean[a] = (float)moved;
-        scale[a] -= 0.47000363f; // log(1.6)
     }
+}
+
+static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, const double normal[3]) {
+    gsf__model_copy_row(model, parent, child);
+    float* scale = model->groups[GSF__SCALES].value + 3 * child;
+    double offset[3];
+    for (int a = 0; a < 3; a++) offset[a] = exp((double)scale[a]) * normal[a];
+    gsf__densify_move(model, child, offset);
+    for (int a = 0; a < 3; a++) scale[a] -= 0.47000363f; // log(1.6)
+}
+
+// Gives a splat of opacity o the opacity 1 - sqrt(1 - o), of which two are as opaque as it was.
+static void gsf__densify_share(gsf__model* model, size_t i) {
+    float* logit = model->groups[GSF__OPACITY].value + i;
+    const double clear = 1.0 / (1.0 + exp((double)*logit)), each = sqrt(clear > 1e-12 ? clear : 1e-12);
+    *logit = (float)(log1p(-each) - log(each));
+}
+
+// One of the two parts of a splat with a shared opacity. side: -1 or 1.
+static void gsf__densify_part(gsf__model* model, size_t parent, size_t child, double side) {
+    const int longest = gsf__model_longest_axis(model, parent);
+    gsf__model_copy_row(model, parent, child);
+    float* scale = model->groups[GSF__SCALES].value + 3 * child + longest;
+    double offset[3] = {0.0, 0.0, 0.0};
+    offset[longest] = side * 0.5 * exp((double)*scale);
+    gsf__densify_move(model, child, offset);
+    *scale -= 0.41551544f; // log(0.66)
+    gsf__densify_share(model, child);
 }
 
 // Removes split parents and the splats to be pruned; the order of the others is kept. Resets the statistics.
@@ -9755,10 +9791,17 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
     const size_t count = model->count;
     size_t clone = count, child = count + clones;
     for (size_t i = 0; i < count; i++) {
-        if (model->action[i] == GSF__CLONE) gsf__model_copy_row(model, i, clone++);
+        if (model->action[i] == GSF__CLONE) {
+            if (rule->shared) gsf__densify_share(model, i);
+            gsf__model_copy_row(model, i, clone++);
+        }
         if (model->action[i] != GSF__SPLIT) continue;
         for (size_t copy = 0; copy < 2; copy++) {
             double normal[3];
+            if (rule->shared) {
+                gsf__densify_part(model, i, child + copy * splits, copy ? 1.0 : -1.0);
+                continue;
+            }
             for (size_t a = 0; a < 3; a++)
                 normal[a] = rule->normals ? (double)rule->normals[(copy * splits + (child - count - clones)) * 3 + a]
                                           : gsf_draw_normal(rule->seed, rule->stream,
@@ -9905,6 +9948,7 @@ typedef struct gsf__photo_set {
 struct gsf_trainer {
     gsf_train_desc desc;     // with defaults filled in
     gsf__photo_set photos, restored;
+    gsf__photo_set coarse;   // the photos at half their size; empty unless desc.coarse_until
     gsf__model model;
     gsf__loss_scratch loss;
     gsf_rasterizer* rasterizer;
@@ -10033,6 +10077,54 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
     return result;
 }
 
+// Copies a photo at half its size: means of 2 x 2 pixels by their weights. An odd last row or column is left out.
+static gsf_result gsf__photo_halve(gsf_context* ctx, const gsf__photo* photo, gsf__photo* out) {
+    const gsf__target* from = &photo->target;
+    const size_t width = (size_t)from->width / 2, height = (size_t)from->height / 2, stride = (size_t)from->width;
+    out->camera = photo->camera;
+    out->camera.width = out->target.width = (int32_t)width;
+    out->camera.height = out->target.height = (int32_t)height;
+    out->camera.fx *= 0.5, out->camera.fy *= 0.5, out->camera.cx *= 0.5, out->camera.cy *= 0.5;
+    out->pixels = gsf_alloc(ctx, width * height, 3 * gsf__dtype_size(from->u8 ? GSF_U8 : GSF_F32));
+    if (from->weight) out->weight = gsf_alloc(ctx, width * height, sizeof(float));
+    if (!out->pixels || (from->weight && !out->weight)) return GSF_ERROR_OUT_OF_MEMORY;
+    uint8_t* bytes = from->u8 ? (uint8_t*)out->pixels : NULL;
+    float *floats = from->u8 ? NULL : (float*)out->pixels, *weights = (float*)out->weight;
+    out->target.u8 = bytes;
+    out->target.f32 = floats;
+    out->target.weight = weights;
+    for (size_t i = 0; i < width * height; i++) {
+        const size_t first = 2 * (i / width) * stride + 2 * (i % width);
+        const size_t at[4] = {first, first + 1, first + stride, first + stride + 1};
+        float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f};
+        for (int k = 0; k < 4; k++) {
+            const float w = from->weight ? from->weight[at[k]] : 1.0f;
+            total += w;
+            for (size_t c = 0; c < 3 && w > 0.0f; c++)
+                sum[c] += w * (from->u8 ? (float)from->u8[3 * at[k] + c] : from->f32[3 * at[k] + c]);
+        }
+        for (size_t c = 0; c < 3; c++) {
+            const float value = total > 0.0f ? sum[c] / total : 0.0f;
+            if (bytes) bytes[3 * i + c] = (uint8_t)(value + 0.5f);
+            else floats[3 * i + c] = value;
+        }
+        if (weights) weights[i] = 0.25f * total;
+    }
+    return GSF_OK;
+}
+
+enum { GSF__COARSE_LEAST = 32 }; // pixels: photos with a shorter side are not halved
+
+static gsf_result gsf__photo_set_halve(gsf_context* ctx, const gsf__photo_set* set, gsf__photo_set* out) {
+    for (size_t i = 0; i < set->count; i++)
+        if (set->photos[i].camera.width < GSF__COARSE_LEAST || set->photos[i].camera.height < GSF__COARSE_LEAST) return GSF_OK;
+    out->photos = (gsf__photo*)gsf_alloc_zeroed(ctx, set->count, sizeof *out->photos);
+    if (!out->photos) return GSF_ERROR_OUT_OF_MEMORY;
+    out->count = set->count;
+    for (size_t i = 0; i < set->count; i++) GSF__TRY(gsf__photo_halve(ctx, set->photos + i, out->photos + i));
+    return GSF_OK;
+}
+
 // The photo of step `step` (from 0). Every `count` steps there is a new permutation, a function of the arguments only.
 static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t kind, uint64_t step) {
     const uint64_t epoch = step / set->count;
@@ -10089,13 +10181,14 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     return d;
 }
 
-enum { GSF__TRAIN_FIELDS = 41 };
+enum { GSF__TRAIN_FIELDS = 43 };
 
 // Every field that a run depends on, with its legal range. `d` has its defaults filled in, except perhaps for the extent.
 static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN_FIELDS]) {
     const gsf__field fields[GSF__TRAIN_FIELDS] = {
         {"iterations", (double)d->iterations, 1, 1e9},
         {"seed", (double)d->seed, 0, INFINITY},
+        {"coarse_until", (double)d->coarse_until, 0, 1e9},
         {"sh_degree", (double)d->sh_degree, 0, 3},
         {"sh_interval", (double)d->sh_interval, 1, 1e9},
         {"densify_from", (double)d->densify_from, 0, 1e9},
@@ -10120,6 +10213,7 @@ static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN
         {"densify_grad", (double)d->densify_grad, 0, 1e30},
         {"densify_scale", (double)d->densify_scale, 0, 1e30},
         {"densify_absolute", (double)d->densify_absolute, -INFINITY, INFINITY},
+        {"densify_shared", (double)d->densify_shared, 0, 1},
         {"prune_opacity", (double)d->prune_opacity, 0, 0.99},
         {"prune_scale", (double)d->prune_scale, 0, 1e30},
         {"max_splats", (double)d->max_splats, 0, UINT32_MAX / 4},
@@ -10326,6 +10420,7 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     GSF__TRY(gsf__train_desc_check(ctx, &trainer->desc));
     if (view_count == 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no training view");
     GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", &trainer->photos));
+    if (trainer->desc.coarse_until > 0) GSF__TRY(gsf__photo_set_halve(ctx, &trainer->photos, &trainer->coarse));
     GSF__TRY(gsf__trainer_take_splats(ctx, trainer, initial));
     if (trainer->desc.extent == 0.0f) GSF__TRY(gsf__trainer_find_extent(ctx, trainer));
     if (!near_given) {
@@ -10543,6 +10638,7 @@ static gsf__densify_rule gsf__trainer_rule(const gsf_trainer* trainer, int32_t i
     if (d->opacity_reset_interval > 0 && iteration > d->opacity_reset_interval)
         rule.prune_scale = (double)d->prune_scale * (double)d->extent;
     rule.max_splats = d->max_splats;
+    rule.shared = d->densify_shared;
     rule.seed = d->seed;
     rule.stream = gsf__stream(GSF__STREAM_SPLIT, (uint64_t)iteration);
     return rule;
@@ -10554,6 +10650,8 @@ static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer,
     const gsf_train_desc* d = &trainer->desc;
     gsf__photo* photos[2] = {NULL, NULL};
     photos[0] = gsf__photo_at(&trainer->photos, d->seed, GSF__STREAM_PHOTOS, (uint64_t)iteration - 1);
+    if (trainer->coarse.count && iteration <= d->coarse_until)
+        photos[0] = trainer->coarse.photos + (photos[0] - trainer->photos.photos);
     if (trainer->restored.count && trainer->restored_weight > 0.0f)
         photos[1] = gsf__photo_at(&trainer->restored, d->seed, GSF__STREAM_RESTORED, trainer->restored_steps);
     for (int k = 0; k < 2; k++) {
@@ -10830,6 +10928,7 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
     if (!trainer) return;
     gsf__photo_set_destroy(ctx, &trainer->photos);
     gsf__photo_set_destroy(ctx, &trainer->restored);
+    gsf__photo_set_destroy(ctx, &trainer->coarse);
     gsf__model_destroy(ctx, &trainer->model);
     gsf__loss_destroy_scratch(ctx, &trainer->loss);
     if (trainer->rasterizer) gsf_splat_destroy_rasterizer(ctx, trainer->rasterizer);

@@ -498,6 +498,58 @@ static void test_cap(gsf_context* ctx) { // close to max_splats, only splats wit
     gsf__model_destroy(ctx, &model);
 }
 
+// With shared opacities, two new splats are as opaque as the old one, and a split is symmetric along its longest axis.
+static void test_shared(gsf_context* ctx) {
+    enum { COUNT = 40 };
+    gsf__model model = make_model(ctx, COUNT, 0), was = make_model(ctx, COUNT, 0);
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.grad = 1.0f;
+    rule.clone_scale = 3.0; // log-scales are within -2..2, so that some are cloned and some split
+    rule.prune_opacity = 1e-6;
+    rule.max_splats = 1000;
+    rule.shared = 1;
+    for (size_t i = 0; i < COUNT; i++) model.grad_sum[0][i] = 2.0f, model.visits[0][i] = 1;
+    was.groups[GSF__OPACITY].value[0] = model.groups[GSF__OPACITY].value[0] = 200.0f; // opacity 1 stays finite
+    size_t clones, splits;
+    gsf__densify_select(&model, &rule, &clones, &splits);
+    CHECK(clones + splits == COUNT && clones > 5 && splits > 5);
+    uint8_t action[COUNT];
+    memcpy(action, model.action, sizeof action);
+    CHECK_OK(ctx, gsf__model_reserve(ctx, &model, COUNT + clones + 2 * splits));
+    gsf__densify_apply(&model, &rule, clones, splits);
+    CHECK(model.count == 2 * COUNT);
+    size_t kept = 0, clone = clones, part = 2 * clones;
+    for (size_t i = 0; i < COUNT; i++) {
+        const int split = action[i] == GSF__SPLIT;
+        const size_t rows[2] = {split ? part : kept++, split ? part++ + splits : clone++};
+        const float *mean = was.groups[GSF__MEANS].value + 3 * i, *scale = was.groups[GSF__SCALES].value + 3 * i;
+        const double opacity = 1.0 / (1.0 + exp(-(double)was.groups[GSF__OPACITY].value[i]));
+        double clear = 1.0, apart = 0.0, longest = -INFINITY;
+        for (int a = 0; a < 3; a++) longest = fmax(longest, (double)scale[a]);
+        for (int k = 0; k < 2; k++) {
+            const float logit = model.groups[GSF__OPACITY].value[rows[k]];
+            CHECK(isfinite(logit));
+            clear *= 1.0 / (1.0 + exp((double)logit));
+            for (int a = 0; a < 3; a++) {
+                const float now = model.groups[GSF__SCALES].value[3 * rows[k] + (size_t)a];
+                const int halved = split && (double)scale[a] == longest;
+                CHECK_NEAR(now, (double)scale[a] + (halved ? log(0.66) : 0.0), 1e-6);
+            }
+        }
+        CHECK_NEAR(clear, 1.0 - opacity, 1e-5);
+        for (size_t a = 0; a < 3; a++) {
+            const double first = (double)model.groups[GSF__MEANS].value[3 * rows[0] + a];
+            const double second = (double)model.groups[GSF__MEANS].value[3 * rows[1] + a];
+            CHECK_NEAR(0.5 * (first + second), (double)mean[a], 2e-6);
+            apart += (first - second) * (first - second);
+        }
+        CHECK_NEAR(sqrt(apart), split ? exp(longest) : 0.0, 1e-5);
+    }
+    gsf__model_destroy(ctx, &model);
+    gsf__model_destroy(ctx, &was);
+}
+
 // ---- MCMC on a bare model --------------------------------------------------------
 
 // The copies together are as opaque as the single splat was, in the centre and on average along a ray through it.
@@ -812,6 +864,7 @@ static gsf_train_desc busy_desc(void) {
     desc.scale_penalty = 0.01f;
     desc.depth_smoothness = 0.01f;
     desc.background[1] = 0.2f;
+    desc.coarse_until = 12;
     return desc;
 }
 
@@ -1030,6 +1083,60 @@ static void test_restored_gradient(gsf_context* ctx, const scene* s) {
     CHECK(memcmp(both->model.screen[0], one->model.screen[0], 2 * SPLATS * sizeof(float)) == 0);
     gsf_splat_destroy_trainer(ctx, both);
     gsf_splat_destroy_trainer(ctx, one);
+}
+
+// Halved photos are means of 2 x 2 pixels by their weights, seen by a camera that projects to half the coordinates; they are
+// trained on up to coarse_until and no longer.
+static void test_coarse(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc = busy_desc();
+    gsf_trainer *coarse, *full;
+    gsf_train_stats a, b;
+    desc.coarse_until = 2;
+    gsf_train_view views[2] = {s->views[0], s->views[1]};
+    static float weights[WIDTH * HEIGHT];
+    for (size_t i = 0; i < WIDTH * HEIGHT; i++) weights[i] = (float)(i * 7 % 5) / 4.0f;
+    views[1].weight = gsf_wrap_image(weights, GSF_F32, WIDTH, HEIGHT, 1);
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, 2, &s->start, &coarse));
+    desc.coarse_until = 0;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, 2, &s->start, &full));
+    CHECK(coarse->coarse.count == 2 && full->coarse.count == 0);
+    for (size_t v = 0; v < 2; v++) {
+        const gsf__photo *small = coarse->coarse.photos + v, *photo = coarse->photos.photos + v;
+        const size_t width = (size_t)small->camera.width, height = (size_t)small->camera.height;
+        const double point[3] = {0.1, -0.2, 0.3};
+        double x, y, z, half_x, half_y, half_z;
+        CHECK(width == WIDTH / 2 && height == HEIGHT / 2 && small->target.width == WIDTH / 2);
+        CHECK(gsf_project_point(&photo->camera, point, &x, &y, &z) &&
+              gsf_project_point(&small->camera, point, &half_x, &half_y, &half_z));
+        CHECK_NEAR(half_x, 0.5 * x, 1e-12);
+        CHECK_NEAR(half_y, 0.5 * y, 1e-12);
+        double worst = 0.0;
+        for (size_t i = 0; i < width * height; i++) {
+            double total = 0.0, sum[3] = {0.0, 0.0, 0.0};
+            for (size_t k = 0; k < 4; k++) {
+                const size_t at = (2 * (i / width) + k / 2) * WIDTH + 2 * (i % width) + k % 2;
+                const double w = photo->target.weight ? (double)photo->target.weight[at] : 1.0;
+                total += w;
+                for (size_t c = 0; c < 3; c++) sum[c] += w * (double)photo->target.f32[3 * at + c];
+            }
+            for (size_t c = 0; c < 3; c++)
+                worst = fmax(worst, fabs((double)small->target.f32[3 * i + c] - (total > 0.0 ? sum[c] / total : 0.0)));
+            if (small->target.weight) worst = fmax(worst, fabs((double)small->target.weight[i] - 0.25 * total));
+        }
+        CHECK(worst < 1e-6);
+    }
+    for (int i = 0; i < 2; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, coarse, &a));
+    take_steps(ctx, full, 2);
+    gsf_buffer state = save_state(ctx, coarse); // from here on they train alike
+    CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, full, "state", state.data, state.size));
+    for (int i = 0; i < 3; i++) {
+        CHECK_OK(ctx, gsf_splat_step_trainer(ctx, coarse, &a));
+        CHECK_OK(ctx, gsf_splat_step_trainer(ctx, full, &b));
+        CHECK(a.loss == b.loss);
+    }
+    gsf_destroy_buffer(ctx, &state);
+    gsf_splat_destroy_trainer(ctx, coarse);
+    gsf_splat_destroy_trainer(ctx, full);
 }
 
 // A negative learning rate means 0: that parameter keeps its values, all others learn. lazy: the SH catch up with rates
@@ -1445,7 +1552,8 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->start, &trainer), GSF_ERROR_NUMERIC);
     s->pixels[1][5] = kept;
 
-    void* fields[] = {&desc.iterations, &desc.sh_degree, &desc.densify_interval, &desc.sh_interval};
+    void* fields[] = {&desc.iterations, &desc.sh_degree, &desc.densify_interval, &desc.sh_interval, &desc.coarse_until,
+                      &desc.densify_shared};
     for (size_t i = 0; i < sizeof fields / sizeof *fields; i++) {
         const int32_t wrong = -7;
         int32_t before;
@@ -1715,6 +1823,7 @@ int main(void) {
     }
     test_regularisers(&ctx);
     test_cap(&ctx);
+    test_shared(&ctx);
     test_mcmc_share();
     test_mcmc_densify(&ctx);
     test_mcmc_clamped(&ctx);
@@ -1726,6 +1835,7 @@ int main(void) {
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
+    test_coarse(&ctx, &s);
     test_settings(&ctx, &s);
     test_linear_photos(&ctx, &s);
     for (int lazy = 0; lazy < 2; lazy++) test_zero_rates(&ctx, &s, lazy);
