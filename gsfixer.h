@@ -574,15 +574,16 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF_ASSERT(x) assert(x)
 #endif
 
-#if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
-#define GSF__X86 1
-#include <immintrin.h>
 // Unoptimised, a function would keep the temporaries of all that is inlined into it: hundreds of KB of stack.
-#if defined(__OPTIMIZE__)
+#if defined(__OPTIMIZE__) && (defined(__GNUC__) || defined(__clang__))
 #define GSF__ALWAYS_INLINE __attribute__((always_inline))
 #else
 #define GSF__ALWAYS_INLINE
 #endif
+
+#if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
+#define GSF__X86 1
+#include <immintrin.h>
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
 #define GSF__INLINE_AVX2 GSF__TARGET_AVX2 GSF__ALWAYS_INLINE static inline
 #define GSF__AVX512 "avx2,fma,f16c,bmi,avx512f,avx512bw,avx512dq,avx512vl"

@@ -2846,14 +2846,6 @@ static gsf_result gsf__nn_config_read(const gsf__nn_config* config, const gsf__n
 
 // ---- >>nn vector: additions to the vector vocabulary of >>lanes ----------------------------
 
-// Prefetches a cache line; `at` may lie outside of the array.
-GSF__SHARED void gsf__nn_prefetch(const float* at) {
-#if GSF__X86
-    _mm_prefetch((const char*)at, _MM_HINT_T0);
-#endif
-    (void)at;
-}
-
 // For the rows of a tile, in named variables: gcc would keep an array in memory.
 #define GSF__SIX(X) X(0) X(1) X(2) X(3) X(4) X(5)
 
@@ -3460,7 +3452,7 @@ GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const flo
     const int64_t dim = job->dim;
     int64_t i = 0;
     for (; i + GSF__LANES <= dim; i += GSF__LANES) {
-        gsf__nn_prefetch(x + dim + i); // the next row
+        gsf__v_fetch(x + dim + i); // the next row
         gsf__v_put(y + i, gsf__norm_value(by, &n, x, i, GSF__LANES), stream);
     }
     if (i < dim) gsf__v_store_first(y + i, gsf__norm_value(by, &n, x, i, (size_t)(dim - i)), (size_t)(dim - i));
@@ -5197,7 +5189,8 @@ static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { /
     }
 }
 
-static void gsf__int8_fetch(const int8_t* p, int64_t count) { // otherwise widening stalls on distant panels
+// Otherwise widening stalls on distant panels. Always inline, see gsf__attention_fetch.
+GSF__ALWAYS_INLINE static inline void gsf__int8_fetch(const int8_t* p, int64_t count) {
 #if defined(__GNUC__) || defined(__clang__)
     for (int64_t i = 0; i < count; i += 64) __builtin_prefetch(p + i, 0, 2);
 #endif
@@ -5541,8 +5534,11 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
 }
 
 // Prefetches a row of a head: rows are a few cache lines each and far apart, which defeats the hardware prefetcher.
-static void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
-    for (int64_t i = 0; row < rows && i < dim; i += 16) gsf__nn_prefetch(from + row * ld + i);
+// Always inline: gcc takes a function that only prefetches for one without effect, and drops the calls.
+GSF__ALWAYS_INLINE static inline void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld,
+                                                           int64_t dim) {
+    for (int64_t i = 0; row < rows && i < dim; i += 16)
+        _mm_prefetch((const char*)(from + row * ld + i), _MM_HINT_T0);
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_pack_rows(const float* from, int64_t rows, int64_t ld, const float* center,
