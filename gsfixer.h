@@ -4196,7 +4196,8 @@ static gsf_result gsf__halve_image(gsf_context* ctx, int pad, gsf_image* image) 
     gsf_image half;
     job.left = pad ? image->width % 2 : 0;
     job.top = pad ? image->height % 2 : 0;
-    GSF__TRY(gsf_make_image(ctx, GSF_F32, (image->width + job.left) / 2, (image->height + job.top) / 2, image->channels, &half));
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, (image->width + job.left) / 2, (image->height + job.top) / 2, image->channels,
+                            &half));
     job.src = image;
     job.dst = &half;
     gsf__parallel_for(ctx, gsf__row_chunks(&half), gsf__halve_rows, &job);

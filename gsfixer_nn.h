@@ -618,11 +618,21 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
                                     adapter_model and adapter_config.json (DreamSim's dreamsim_ensemble_checkpoint)
                    motion           amt-s
                    overall          ViClip-InternVid-10M-FLT, and bpe_simple_vocab_16e6.txt.gz (CLIP's list of merges)
-   CONVENTIONS Reported LPIPS values follow one of two: images scaled to [-1,1], as the lpips package documents it and as
-               gsplat's trainer uses AlexNet; or images in [0,1] taken as if they were in [-1,1] (`raw`), as 3DGS, GSFixer
-               and gsplat's trainer use VGG16. The values of the two cannot be compared.
+   CONVENTIONS Values of different conventions cannot be compared. The names are those of `gsfix metrics --which`.
+                   3DGS, GSFixer and papers with 3DGS's metrics.py    psnr, ssim_3dgs, lpips_vgg_raw
+                   gsplat's trainer                                   psnr, ssim_torchmetrics; lpips_alex, or with its option
+                                                                      for VGG16 lpips_vgg_raw
+                   the lpips package as documented (NeRF papers)      lpips_alex, lpips_vgg
+                   scikit-image with its defaults                     ssim_skimage
+                   VBench (I2V_SC, I2V_BC, OC, TF, MS in GSFixer)     i2v_subject, i2v_background, overall_consistency,
+                                                                      temporal_flickering, motion_smoothness
+               LPIPS: images are scaled to [-1,1], as the lpips package documents it; or images in [0,1] are taken as if they
+               were in [-1,1] (`raw`). GSFixer resizes restored frames to the size of the photos before it compares them
+               (bilinear, not antialiased), saves both with 8 bits, and averages per image, then per scene.
                I2V follows VBench with torchvision 0.17 or later: frames are resized with antialiasing. Motion needs frames
-               of at least 113 x 113 pixels; of an even number of frames the last is not used. */
+               of at least 113 x 113 pixels; of an even number of frames the last is not used. Overall consistency looks at 8
+               frames and the first 30 tokens of its text; GSFixer does not say which texts its table was made with. VBench
+               reads videos: the coding that GSFixer's have gone through changes flickering and smoothness. */
 
 typedef enum gsf_nn_metric_kind {
     GSF_NN_METRIC_LPIPS_ALEX = 0, GSF_NN_METRIC_LPIPS_VGG, GSF_NN_METRIC_LPIPS_SQUEEZE, // Zhang et al. 2018; low is good
