@@ -319,7 +319,9 @@ static void check_flickering(gsf_context* ctx) {
     if (!CHECK_OK(ctx, gsf_parse_json(ctx, "vbench_expected.json", text, size, &json))) return;
     for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
         if (strncmp(json.values[i].key, "tf.", 3) != 0) continue;
-        test_tensor t = test_find_tensor(&file, json.values[i].key);
+        char name[96];
+        snprintf(name, sizeof name, "%s.frames", json.values[i].key);
+        test_tensor t = test_find_tensor(&file, name);
         double sum = 0.0, now = 0.0;
         if (!CHECK(t.v && t.rank == 4)) continue;
         const size_t frame = t.dim[1] * t.dim[2] * t.dim[3];

@@ -272,6 +272,30 @@ static void viclip_check_places(gsf_context* ctx) { // frame_indices_middle8 of 
     free(text);
 }
 
+static void viclip_check_resize(void) { // pre.NAME.viclip_resize24_bicubic_noaa_crop of the metrics' golden files
+    static const char* const names[2] = {"tall", "wide"};
+    test_tensors file = test_open_tensors(test_golden("metrics/vbench.safetensors"));
+    for (int i = 0; i < 2; i++) {
+        char key[96];
+        snprintf(key, sizeof key, "pre.%s.input", names[i]);
+        test_tensor in = test_get_tensor(&file, key);
+        snprintf(key, sizeof key, "pre.%s.viclip_resize24_bicubic_noaa_crop", names[i]);
+        test_tensor expected = test_get_tensor(&file, key);
+        const size_t area = in.dim[1] * in.dim[2];
+        uint8_t* bytes = (uint8_t*)malloc(in.count);
+        float* pixels = (float*)malloc(expected.count * sizeof(float));
+        for (size_t k = 0; k < in.count; k++) bytes[k % area * 3 + k / area] = (uint8_t)in.v[k];
+        const gsf_image image = gsf_wrap_image(bytes, GSF_U8, (int64_t)in.dim[2], (int64_t)in.dim[1], 3);
+        gsf__viclip_resize(&image, (int64_t)expected.dim[1], pixels);
+        for (size_t k = 0; k < expected.count; k++) CHECK(fabs(255.0 * (double)pixels[k] - expected.v[k]) < 1.01);
+        free(bytes);
+        free(pixels);
+        test_free_tensor(&in);
+        test_free_tensor(&expected);
+    }
+    test_close_tensors(&file);
+}
+
 static inline void check_viclip(void) {
     gsf_context ctx;
     golden_config config;
@@ -318,6 +342,7 @@ static inline void check_viclip(void) {
     viclip_check_errors(&ctx, &io, models, heads);
     viclip_check_merges(&ctx);
     viclip_check_places(&ctx);
+    viclip_check_resize();
     test_close_tensors(&io);
     golden_close_config(&ctx, &config);
 }

@@ -66,7 +66,8 @@ def pixels(root):
         p, q = tensor(x), tensor(y)
         compare("SSIM torchmetrics" + size, ours["ssim_torchmetrics"],
                 tm.structural_similarity_index_measure(p, q, data_range=1.0).item(), 1e-7)
-        compare("MS-SSIM pytorch-msssim" + size, ours["ms_ssim"], pytorch_msssim.ms_ssim(p, q, data_range=1.0).item(), 3e-6)  # its window is float32
+        compare("MS-SSIM pytorch-msssim" + size, ours["ms_ssim"],
+                pytorch_msssim.ms_ssim(p, q, data_range=1.0).item(), 3e-6)  # its window is float32
         compare("MS-SSIM torchmetrics" + size, ours["ms_ssim_torchmetrics"],
                 tm.multiscale_structural_similarity_index_measure(p, q, data_range=1.0, normalize="relu").item(), 1e-6)
 
