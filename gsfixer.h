@@ -3925,11 +3925,29 @@ typedef struct gsf__pixel_job {
     gsf__metric_sum* sums; // one per chunk
 } gsf__pixel_job;
 
+static int gsf__is_packed_bytes(const gsf_image* image) { // along rows
+    return image->dtype == GSF_U8 && image->stride_c == 1 && image->stride_x == image->channels;
+}
+
 static void gsf__pixel_rows(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__pixel_job* job = (const gsf__pixel_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
     const gsf__rows rows = gsf__chunk_rows(a, chunk);
+    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) { // in integers
+        const int64_t n = a->width * a->channels;
+        uint64_t all = 0;
+        for (int64_t y = rows.begin; y < rows.end; y++) {
+            const uint8_t *u = (const uint8_t*)a->data + y * a->stride_y, *v = (const uint8_t*)b->data + y * b->stride_y;
+            for (int64_t i = 0; i < n; i++) {
+                const int d = u[i] - v[i];
+                all += (uint64_t)(job->absolute ? (d < 0 ? -d : d) : d * d);
+            }
+        }
+        job->sums[chunk].sum = (double)all / (job->absolute ? 255.0 : 255.0 * 255.0);
+        job->sums[chunk].count = (uint64_t)(n * (rows.end - rows.begin));
+        return;
+    }
     double pa[GSF__CONVERT_RUN], pb[GSF__CONVERT_RUN], sum = 0.0;
     uint64_t count = 0;
     for (int64_t y = rows.begin; y < rows.end; y++)
@@ -3981,42 +3999,45 @@ GSF_API gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, 
     return gsf__pixel_mean(ctx, "difference", 1, a, b, mask, out);
 }
 
-/* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring
-   buffer with as many rows as the window; blurring the ring along y gives a row of the SSIM map. Each chunk of rows fills
-   its own ring, so that chunks are independent. */
+/* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab; four where only
+   the sum of both variances counts: a, b, aa + bb, ab) into a ring buffer with as many rows as the window; blurring the ring
+   along y gives a row of the SSIM map. Each chunk of rows fills its own ring, so that chunks are independent. */
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
-// out[i] = sum over t of weights[t] * rows[t][i], t ascending. The AVX2 version does the same operations in the same order,
-// four i at a time.
+// out[i] = sum over t of weights[t] * rows[t][i], where taps is odd and the weights are symmetric: pairs of rows are added
+// first, from the outermost one to the centre. The AVX2 version does the same operations in the same order, four i at a time.
 static void gsf__ssim_blur_scalar(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
+    const int last = taps - 1;
     for (size_t i = 0; i < n; i++) {
-        double sum = weights[0] * rows[0][i];
-        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
-        out[i] = sum;
+        double sum = weights[0] * (rows[0][i] + rows[last][i]);
+        for (int t = 1; t < taps / 2; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
+        out[i] = sum + weights[taps / 2] * rows[taps / 2][i];
     }
 }
 
 #if GSF__X86
 GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights,
                                                  int taps, size_t n) {
+    const int last = taps - 1, half = taps / 2;
+    const __m256d w0 = _mm256_set1_pd(weights[0]), centre = _mm256_set1_pd(weights[half]);
     size_t i = 0;
     for (; i + 8 <= n; i += 8) {
-        const __m256d w = _mm256_set1_pd(weights[0]);
-        __m256d s0 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i));
-        __m256d s1 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i + 4));
-        for (int t = 1; t < taps; t++) {
-            const __m256d v = _mm256_set1_pd(weights[t]);
-            s0 = _mm256_add_pd(s0, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i)));
-            s1 = _mm256_add_pd(s1, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i + 4)));
+        __m256d s0 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i), _mm256_loadu_pd(rows[last] + i)));
+        __m256d s1 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i + 4), _mm256_loadu_pd(rows[last] + i + 4)));
+        for (int t = 1; t < half; t++) {
+            const double *a = rows[t] + i, *b = rows[last - t] + i;
+            const __m256d w = _mm256_set1_pd(weights[t]);
+            s0 = _mm256_add_pd(s0, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a), _mm256_loadu_pd(b))));
+            s1 = _mm256_add_pd(s1, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a + 4), _mm256_loadu_pd(b + 4))));
         }
-        _mm256_storeu_pd(out + i, s0);
-        _mm256_storeu_pd(out + i + 4, s1);
+        _mm256_storeu_pd(out + i, _mm256_add_pd(s0, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i))));
+        _mm256_storeu_pd(out + i + 4, _mm256_add_pd(s1, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i + 4))));
     }
     for (; i < n; i++) {
-        double sum = weights[0] * rows[0][i];
-        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
-        out[i] = sum;
+        double sum = weights[0] * (rows[0][i] + rows[last][i]);
+        for (int t = 1; t < half; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
+        out[i] = sum + weights[half] * rows[half][i];
     }
 }
 #endif
@@ -4028,6 +4049,7 @@ typedef struct gsf__ssim_job {
     double weights[GSF__SSIM_MAX_TAPS];
     int64_t inset;           // map rows and columns left out at each border
     int contrast;            // sum only SSIM's factor of contrast and structure
+    size_t quantities;
     size_t chunks_per_channel;
     gsf__metric_sum* sums;   // one per (channel, chunk)
     double* scratch;         // per worker: padded source rows, ring, quantities of a map row
@@ -4046,7 +4068,7 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
     const size_t width = (size_t)a->width, wide = width + 2 * (size_t)radius;
     if (y < 0 || y >= a->height) {
         if (job->kind == GSF_SSIM_3DGS) { // zero padding
-            for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) memset(out + q * pitch, 0, width * sizeof(double));
+            for (size_t q = 0; q < job->quantities; q++) memset(out + q * pitch, 0, width * sizeof(double));
             return;
         }
         y = gsf__reflect(y, a->height);
@@ -4065,14 +4087,15 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
             p[right] = mirror ? p[gsf__reflect(right, a->width)] : 0.0;
         }
     }
-    double *paa = pb + wide, *pbb = paa + wide, *pab = pbb + wide;
+    double *paa = pb + wide, *pbb = paa + wide, *pab = padded + (job->quantities - 1) * wide;
     for (size_t i = 0; i < wide; i++) {
-        paa[i] = pa[i] * pa[i];
-        pbb[i] = pb[i] * pb[i];
+        const double aa = pa[i] * pa[i], bb = pb[i] * pb[i];
+        paa[i] = job->quantities == 4 ? aa + bb : aa;
+        pbb[i] = bb; // where this is the place of pab, it is overwritten
         pab[i] = pa[i] * pb[i];
     }
     const double* rows[GSF__SSIM_MAX_TAPS];
-    for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+    for (size_t q = 0; q < job->quantities; q++) {
         for (int t = 0; t < job->taps; t++) rows[t] = padded + q * wide + t;
         job->blur(out + q * pitch, rows, job->weights, job->taps, width);
     }
@@ -4111,14 +4134,15 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
         const int64_t row = y - radius;
         if (row < first) continue;
         const double* rows[GSF__SSIM_MAX_TAPS];
-        for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+        for (size_t q = 0; q < job->quantities; q++) {
             for (size_t t = 0; t < taps; t++) rows[t] = ring + (q * taps + (slot + 1 + t) % taps) * width;
             job->blur(map + q * width, rows, job->weights, job->taps, width);
         }
+        const double *covariances = map + (job->quantities - 1) * width, *squares = map + 3 * width;
         for (size_t x = (size_t)job->inset; x < width - (size_t)job->inset; x++)
             if (gsf__mask_at(job->mask, (int64_t)x, row)) {
                 sum += gsf__ssim_value(job->kind, job->contrast, map[x], map[width + x], map[2 * width + x],
-                                       map[3 * width + x], map[4 * width + x]);
+                                       job->quantities == 4 ? 0.0 : squares[x], covariances[x]);
                 count++;
             }
     }
@@ -4142,6 +4166,7 @@ static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_ssim_kind kind, int contra
     job->mask = mask;
     job->kind = kind;
     job->contrast = contrast;
+    job->quantities = kind == GSF_SSIM_TORCHMETRICS || kind == GSF_SSIM_MULTISCALE_TORCHMETRICS ? 5 : 4; // clamped one by one
     job->taps = kind == GSF_SSIM_SKIMAGE ? 7 : 11;
     job->radius = job->taps / 2;
     for (int t = 0; t < job->taps; t++)
