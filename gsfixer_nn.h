@@ -14950,8 +14950,9 @@ static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima
         for (int64_t v = y0; v < y1; v++)
             for (int64_t u = x0; u < x1; u++) {
                 const float* from = x->data + ((image * x->height + v) * x->width + u) * c;
-                const int first = v == y0 && u == x0;
-                for (int64_t i = 0; i < c; i++) out[i] = first || !(from[i] <= out[i]) ? from[i] : out[i];
+                if (v == y0 && u == x0) memcpy(out, from, (size_t)c * sizeof(float));
+                else
+                    for (int64_t i = 0; i < c; i++) out[i] = from[i] <= out[i] ? out[i] : from[i]; // a NaN remains
             }
     }
 }
