@@ -376,18 +376,26 @@ typedef enum gsf_ssim_kind {
     GSF_SSIM_3DGS,         // 11x11 Gaussian sigma 1.5, zero padding, variances not clamped: the 3DGS papers' figure
     GSF_SSIM_TORCHMETRICS, // the same kernel, reflect padding, variances clamped at 0 (gsplat's trainer)
     GSF_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the interior
+    GSF_SSIM_MULTISCALE,   // MS-SSIM (Wang et al. 2003) over five scales, as pytorch-msssim computes it: per channel, means
+                           // over the interior; halving an odd side pads it with a line of zeros in front
+    GSF_SSIM_MULTISCALE_TORCHMETRICS, // as torchmetrics does: over all channels together, the last scale with the reflected
+                           // border, variances clamped at 0; halving an odd side drops its last line
 } gsf_ssim_kind;
 
 // Both images must have the same size and channel count; dtypes may differ (floats in [0,1], integers are scaled to
 // value / maximum). All sums are in double and in a fixed order. A NaN or infinity in a counted pixel gives
 // GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
-// them). If the mask excludes all pixels, or the image is smaller than the window needs (6 pixels for TORCHMETRICS, 7 for
-// SKIMAGE), the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
+// them; MS-SSIM takes no mask). If the mask excludes all pixels, or the image is smaller than the windows need (sides of 6
+// pixels for TORCHMETRICS, 7 for SKIMAGE, 161 for MULTISCALE, 176 for MULTISCALE_TORCHMETRICS), the result is
+// GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
 GSF_API GSF_NODISCARD gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
                                                   const gsf_image* mask, double* out);
 GSF_API GSF_NODISCARD gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a,
                                                   const gsf_image* b, const gsf_image* mask, double* out);
+// The mean absolute difference. VBench's temporal flickering of a clip is 1 less its mean over pairs of successive frames.
+GSF_API GSF_NODISCARD gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
+                                                        const gsf_image* mask, double* out);
 
 // ---- cameras -------------------------------------------------------------------
 
@@ -1042,6 +1050,59 @@ GSF__SHARED gsf_result gsf__inflate(gsf_context* ctx, const char* name, const vo
 GSF__SHARED gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size,
                                     gsf_buffer* out) {
     return ctx->services->deflate_fn(ctx, name, data, size, out);
+}
+
+/* gzip (RFC 1952) around DEFLATE:
+       1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] |
+       DEFLATE | crc32 4 | size modulo 2^32 4 */
+
+enum { GSF__DEFLATE_RATIO = 1032 }; // upper bound of DEFLATE's compression ratio
+
+GSF__SHARED gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
+                                           size_t* body) {
+    size_t at = 10;
+    if (size < 2 || p[0] != 0x1f || p[1] != 0x8b)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not gzip (1f 8b expected)", name);
+    if (size < 18) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut", name, size);
+    if (p[2] != 8 || (p[3] & 0xe0) != 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:2: gzip method %d, flags %d: not supported", name, p[2], p[3]);
+    if (p[3] & 4) at += 2 + (size_t)gsf__load_le(p + 10, 2);
+    for (int text = 8; text <= 16; text *= 2) // optional NUL-terminated name and comment
+        if (p[3] & text) {
+            while (at < size && p[at]) at++;
+            at++;
+        }
+    if (p[3] & 2) at += 2;
+    if (at > size - 8) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut inside the gzip header", name, size);
+    *body = at;
+    return GSF_OK;
+}
+
+// Inflates a gzip file into *out (freed by the caller), *out_size > 0 bytes. The size comes from the file's trailer; it
+// is rejected when DEFLATE could not have compressed that much into a file of this size.
+GSF__SHARED gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
+                                      unsigned char** out, size_t* out_size) {
+    size_t body = 0;
+    *out = NULL;
+    *out_size = 0;
+    GSF__TRY(gsf__gzip_read_head(ctx, name, data, size, &body));
+    const size_t whole = (size_t)gsf__load_le(data + size - 4, 4);
+    if (whole == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: gzip file without content", name, size - 4);
+    if (whole / GSF__DEFLATE_RATIO > size - body - 8)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes of content claimed, more than %zu can inflate to", name,
+                        size - 4, whole, size - body - 8);
+    unsigned char* content = (unsigned char*)gsf_alloc(ctx, whole, 1);
+    if (!content) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = gsf__inflate(ctx, name, data, size, body, content, whole);
+    if (result == GSF_OK && gsf__load_le(data + size - 8, 4) != gsf__crc32(0, content, whole))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: checksum mismatch", name, size - 8);
+    if (result != GSF_OK) {
+        gsf_free(ctx, content);
+        return result;
+    }
+    *out = content;
+    *out_size = whole;
+    return GSF_OK;
 }
 
 // Parses JSON that begins at byte `start` of a file. Offsets, including those in error messages, count from the start of
@@ -3859,16 +3920,35 @@ static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf
     return GSF_OK;
 }
 
-typedef struct gsf__psnr_job {
+typedef struct gsf__pixel_job {
     const gsf_image *a, *b, *mask;
+    int absolute;          // sums absolute differences instead of squares
     gsf__metric_sum* sums; // one per chunk
-} gsf__psnr_job;
+} gsf__pixel_job;
 
-static void gsf__psnr_rows(void* arg, size_t chunk, int32_t worker) {
+static int gsf__is_packed_bytes(const gsf_image* image) { // along rows
+    return image->dtype == GSF_U8 && image->stride_c == 1 && image->stride_x == image->channels;
+}
+
+static void gsf__pixel_rows(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
-    const gsf__psnr_job* job = (const gsf__psnr_job*)arg;
+    const gsf__pixel_job* job = (const gsf__pixel_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
     const gsf__rows rows = gsf__chunk_rows(a, chunk);
+    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) { // in integers
+        const int64_t n = a->width * a->channels;
+        uint64_t all = 0;
+        for (int64_t y = rows.begin; y < rows.end; y++) {
+            const uint8_t *u = (const uint8_t*)a->data + y * a->stride_y, *v = (const uint8_t*)b->data + y * b->stride_y;
+            for (int64_t i = 0; i < n; i++) {
+                const int d = u[i] - v[i];
+                all += (uint64_t)(job->absolute ? (d < 0 ? -d : d) : d * d);
+            }
+        }
+        job->sums[chunk].sum = (double)all / (job->absolute ? 255.0 : 255.0 * 255.0);
+        job->sums[chunk].count = (uint64_t)(n * (rows.end - rows.begin));
+        return;
+    }
     double pa[GSF__CONVERT_RUN], pb[GSF__CONVERT_RUN], sum = 0.0;
     uint64_t count = 0;
     for (int64_t y = rows.begin; y < rows.end; y++)
@@ -3881,7 +3961,7 @@ static void gsf__psnr_rows(void* arg, size_t chunk, int32_t worker) {
                                  b->stride_x, b->dtype, (size_t)n, pb);
                 for (int64_t i = 0; i < n; i++)
                     if (gsf__mask_at(job->mask, x + i, y)) {
-                        sum += (pa[i] - pb[i]) * (pa[i] - pb[i]);
+                        sum += job->absolute ? fabs(pa[i] - pb[i]) : (pa[i] - pb[i]) * (pa[i] - pb[i]);
                         count++;
                     }
             }
@@ -3889,60 +3969,76 @@ static void gsf__psnr_rows(void* arg, size_t chunk, int32_t worker) {
     job->sums[chunk].count = count;
 }
 
-GSF_API gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
-                                    double* out) {
-    GSF__TRY(gsf__check_image_pair(ctx, "psnr", a, b, mask));
-    gsf__psnr_job job;
+// The mean of squared or absolute differences.
+static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolute, const gsf_image* a, const gsf_image* b,
+                                  const gsf_image* mask, double* out) {
+    GSF__TRY(gsf__check_image_pair(ctx, what, a, b, mask));
+    gsf__pixel_job job;
     job.a = a;
     job.b = b;
     job.mask = mask;
+    job.absolute = absolute;
     const size_t chunks = gsf__row_chunks(a);
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__parallel_for(ctx, chunks, gsf__psnr_rows, &job);
-    double mse = 0.0;
-    const gsf_result result = gsf__metric_mean(ctx, "psnr", job.sums, chunks, &mse);
+    gsf__parallel_for(ctx, chunks, gsf__pixel_rows, &job);
+    const gsf_result result = gsf__metric_mean(ctx, what, job.sums, chunks, out);
     gsf_free(ctx, job.sums);
-    if (result == GSF_OK) *out = mse > 0.0 ? -10.0 * log10(mse) : (double)INFINITY;
     return result;
 }
 
-/* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring
-   buffer with as many rows as the window; blurring the ring along y gives a row of the SSIM map. Each chunk of rows fills
-   its own ring, so that chunks are independent. */
+GSF_API gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                                    double* out) {
+    double mse = 0.0;
+    GSF__TRY(gsf__pixel_mean(ctx, "psnr", 0, a, b, mask, &mse));
+    *out = mse > 0.0 ? -10.0 * log10(mse) : (double)INFINITY;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                                          double* out) {
+    return gsf__pixel_mean(ctx, "difference", 1, a, b, mask, out);
+}
+
+/* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab; four where only
+   the sum of both variances counts: a, b, aa + bb, ab) into a ring buffer with as many rows as the window; blurring the ring
+   along y gives a row of the SSIM map. Each chunk of rows fills its own ring, so that chunks are independent. */
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
-// out[i] = sum over t of weights[t] * rows[t][i], t ascending. The AVX2 version does the same operations in the same order,
-// four i at a time.
+// out[i] = sum over t of weights[t] * rows[t][i], where taps is odd and the weights are symmetric: pairs of rows are added
+// first, from the outermost one to the centre. The AVX2 version does the same operations in the same order, four i at a time.
 static void gsf__ssim_blur_scalar(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
+    const int last = taps - 1;
     for (size_t i = 0; i < n; i++) {
-        double sum = weights[0] * rows[0][i];
-        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
-        out[i] = sum;
+        double sum = weights[0] * (rows[0][i] + rows[last][i]);
+        for (int t = 1; t < taps / 2; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
+        out[i] = sum + weights[taps / 2] * rows[taps / 2][i];
     }
 }
 
 #if GSF__X86
 GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights,
                                                  int taps, size_t n) {
+    const int last = taps - 1, half = taps / 2;
+    const __m256d w0 = _mm256_set1_pd(weights[0]), centre = _mm256_set1_pd(weights[half]);
     size_t i = 0;
     for (; i + 8 <= n; i += 8) {
-        const __m256d w = _mm256_set1_pd(weights[0]);
-        __m256d s0 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i));
-        __m256d s1 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i + 4));
-        for (int t = 1; t < taps; t++) {
-            const __m256d v = _mm256_set1_pd(weights[t]);
-            s0 = _mm256_add_pd(s0, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i)));
-            s1 = _mm256_add_pd(s1, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i + 4)));
+        __m256d s0 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i), _mm256_loadu_pd(rows[last] + i)));
+        __m256d s1 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i + 4), _mm256_loadu_pd(rows[last] + i + 4)));
+        for (int t = 1; t < half; t++) {
+            const double *a = rows[t] + i, *b = rows[last - t] + i;
+            const __m256d w = _mm256_set1_pd(weights[t]);
+            s0 = _mm256_add_pd(s0, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a), _mm256_loadu_pd(b))));
+            s1 = _mm256_add_pd(s1, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a + 4), _mm256_loadu_pd(b + 4))));
         }
-        _mm256_storeu_pd(out + i, s0);
-        _mm256_storeu_pd(out + i + 4, s1);
+        _mm256_storeu_pd(out + i, _mm256_add_pd(s0, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i))));
+        _mm256_storeu_pd(out + i + 4, _mm256_add_pd(s1, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i + 4))));
     }
     for (; i < n; i++) {
-        double sum = weights[0] * rows[0][i];
-        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
-        out[i] = sum;
+        double sum = weights[0] * (rows[0][i] + rows[last][i]);
+        for (int t = 1; t < half; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
+        out[i] = sum + weights[half] * rows[half][i];
     }
 }
 #endif
@@ -3953,6 +4049,8 @@ typedef struct gsf__ssim_job {
     int taps, radius;
     double weights[GSF__SSIM_MAX_TAPS];
     int64_t inset;           // map rows and columns left out at each border
+    int contrast;            // sum only SSIM's factor of contrast and structure
+    size_t quantities;
     size_t chunks_per_channel;
     gsf__metric_sum* sums;   // one per (channel, chunk)
     double* scratch;         // per worker: padded source rows, ring, quantities of a map row
@@ -3971,7 +4069,7 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
     const size_t width = (size_t)a->width, wide = width + 2 * (size_t)radius;
     if (y < 0 || y >= a->height) {
         if (job->kind == GSF_SSIM_3DGS) { // zero padding
-            for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) memset(out + q * pitch, 0, width * sizeof(double));
+            for (size_t q = 0; q < job->quantities; q++) memset(out + q * pitch, 0, width * sizeof(double));
             return;
         }
         y = gsf__reflect(y, a->height);
@@ -3983,30 +4081,31 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
                      pb + radius);
     for (int64_t x = -radius; x < 0; x++) { // pad both sides with zeros or the reflection
         const int64_t right = a->width - 1 - x; // as far outside the right border as x is outside the left
-        const int mirror = job->kind == GSF_SSIM_TORCHMETRICS;
+        const int mirror = job->kind == GSF_SSIM_TORCHMETRICS || job->kind == GSF_SSIM_MULTISCALE_TORCHMETRICS;
         for (int i = 0; i < 2; i++) {
             double* p = (i ? pb : pa) + radius;
             p[x] = mirror ? p[-x] : 0.0;
             p[right] = mirror ? p[gsf__reflect(right, a->width)] : 0.0;
         }
     }
-    double *paa = pb + wide, *pbb = paa + wide, *pab = pbb + wide;
+    double *paa = pb + wide, *pbb = paa + wide, *pab = padded + (job->quantities - 1) * wide;
     for (size_t i = 0; i < wide; i++) {
-        paa[i] = pa[i] * pa[i];
-        pbb[i] = pb[i] * pb[i];
+        const double aa = pa[i] * pa[i], bb = pb[i] * pb[i];
+        paa[i] = job->quantities == 4 ? aa + bb : aa;
+        pbb[i] = bb; // where this is the place of pab, it is overwritten
         pab[i] = pa[i] * pb[i];
     }
     const double* rows[GSF__SSIM_MAX_TAPS];
-    for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+    for (size_t q = 0; q < job->quantities; q++) {
         for (int t = 0; t < job->taps; t++) rows[t] = padded + q * wide + t;
         job->blur(out + q * pitch, rows, job->weights, job->taps, width);
     }
 }
 
-static double gsf__ssim_value(gsf_ssim_kind kind, double ma, double mb, double maa, double mbb, double mab) {
+static double gsf__ssim_value(gsf_ssim_kind kind, int contrast, double ma, double mb, double maa, double mbb, double mab) {
     const double c1 = 0.01 * 0.01, c2 = 0.03 * 0.03;
     double va = maa - ma * ma, vb = mbb - mb * mb, cov = mab - ma * mb;
-    if (kind == GSF_SSIM_TORCHMETRICS) {
+    if (kind == GSF_SSIM_TORCHMETRICS || kind == GSF_SSIM_MULTISCALE_TORCHMETRICS) {
         if (va < 0.0) va = 0.0;
         if (vb < 0.0) vb = 0.0;
     } else if (kind == GSF_SSIM_SKIMAGE) { // unbiased covariance of 7 x 7 samples
@@ -4014,6 +4113,7 @@ static double gsf__ssim_value(gsf_ssim_kind kind, double ma, double mb, double m
         vb *= 49.0 / 48.0;
         cov *= 49.0 / 48.0;
     }
+    if (contrast) return (2.0 * cov + c2) / (va + vb + c2);
     return ((2.0 * ma * mb + c1) * (2.0 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
 }
 
@@ -4035,14 +4135,15 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
         const int64_t row = y - radius;
         if (row < first) continue;
         const double* rows[GSF__SSIM_MAX_TAPS];
-        for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+        for (size_t q = 0; q < job->quantities; q++) {
             for (size_t t = 0; t < taps; t++) rows[t] = ring + (q * taps + (slot + 1 + t) % taps) * width;
             job->blur(map + q * width, rows, job->weights, job->taps, width);
         }
+        const double *covariances = map + (job->quantities - 1) * width, *squares = map + 3 * width;
         for (size_t x = (size_t)job->inset; x < width - (size_t)job->inset; x++)
             if (gsf__mask_at(job->mask, (int64_t)x, row)) {
-                sum += gsf__ssim_value(job->kind, map[x], map[width + x], map[2 * width + x], map[3 * width + x],
-                                       map[4 * width + x]);
+                sum += gsf__ssim_value(job->kind, job->contrast, map[x], map[width + x], map[2 * width + x],
+                                       job->quantities == 4 ? 0.0 : squares[x], covariances[x]);
                 count++;
             }
     }
@@ -4050,8 +4151,9 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
     job->sums[chunk].count = count;
 }
 
-GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
-                                    const gsf_image* mask, double* out) {
+// Sums the SSIM map, or its contrast, over each channel's chunks of rows: job->sums, freed by the caller.
+static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_ssim_kind kind, int contrast, const gsf_image* a, const gsf_image* b,
+                                const gsf_image* mask, gsf__ssim_job* job) {
     // exp(-x^2 / (2 * 1.5^2)) / sum for x = 0..5. First row: the Inria 3DGS code rounds these taps to float32 and then their
     // products once more, so its window sums to 1 - 6.94e-8, which adds 6.94e-8 mu^2 to its variances. These are the rounded
     // taps, scaled to give that sum. Second row: in double, as torchmetrics computes them for double images.
@@ -4059,47 +4161,137 @@ GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const 
                                         0.007598758182733767, 0.0010283801202764127},
                                        {0.26601172486179436, 0.21300553771125369, 0.10936068950970002,
                                         0.036000772128430829, 0.007598758135239185, 0.0010283800844791101}};
-    GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));
-    gsf__ssim_job job;
-    memset(&job, 0, sizeof job);
-    job.a = a;
-    job.b = b;
-    job.mask = mask;
-    job.kind = kind;
-    switch (kind) {
-        case GSF_SSIM_3DGS:
-        case GSF_SSIM_TORCHMETRICS:
-            job.taps = 11;
-            for (int t = 0; t < 11; t++) job.weights[t] = gauss[kind == GSF_SSIM_TORCHMETRICS][t < 5 ? 5 - t : t - 5];
-            break;
-        case GSF_SSIM_SKIMAGE:
-            job.taps = 7;
-            job.inset = 3;
-            for (int t = 0; t < 7; t++) job.weights[t] = 1.0 / 7.0;
-            break;
-        default: return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ssim: kind %d", (int)kind);
-    }
-    job.radius = job.taps / 2;
-    const int64_t least = kind == GSF_SSIM_3DGS ? 1 : kind == GSF_SSIM_TORCHMETRICS ? 6 : 7;
-    if (a->width < least || a->height < least)
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
-                        (long long)a->height);
-    job.blur = GSF__KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
-    job.chunks_per_channel = (size_t)((a->height - 2 * job.inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
+    memset(job, 0, sizeof *job);
+    job->a = a;
+    job->b = b;
+    job->mask = mask;
+    job->kind = kind;
+    job->contrast = contrast;
+    job->quantities = kind == GSF_SSIM_TORCHMETRICS || kind == GSF_SSIM_MULTISCALE_TORCHMETRICS ? 5 : 4; // clamped one by one
+    job->taps = kind == GSF_SSIM_SKIMAGE ? 7 : 11;
+    job->radius = job->taps / 2;
+    for (int t = 0; t < job->taps; t++)
+        job->weights[t] = kind == GSF_SSIM_SKIMAGE ? 1.0 / 7.0 : gauss[kind != GSF_SSIM_3DGS][t < 5 ? 5 - t : t - 5];
+    if (kind == GSF_SSIM_SKIMAGE || kind == GSF_SSIM_MULTISCALE || contrast) job->inset = job->radius;
+    job->blur = GSF__KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
+    job->chunks_per_channel = (size_t)((a->height - 2 * job->inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
     size_t chunks = 0;
-    if (!gsf__mul_size(job.chunks_per_channel, (size_t)a->channels, &chunks) ||
-        !gsf__mul_size((size_t)a->width + 2 * (size_t)job.radius, GSF__SSIM_QUANTITIES * ((size_t)job.taps + 2),
-                       &job.scratch_size))
+    if (!gsf__mul_size(job->chunks_per_channel, (size_t)a->channels, &chunks) ||
+        !gsf__mul_size((size_t)a->width + 2 * (size_t)job->radius, GSF__SSIM_QUANTITIES * ((size_t)job->taps + 2),
+                       &job->scratch_size))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "ssim: image too large");
-    job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
-    job.scratch = (double*)gsf_alloc(ctx, job.scratch_size, (size_t)ctx->parallel.worker_count * sizeof(double));
-    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    if (job.sums && job.scratch) {
-        gsf__parallel_for(ctx, chunks, gsf__ssim_rows, &job);
-        result = gsf__metric_mean(ctx, "ssim", job.sums, chunks, out);
+    job->sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job->sums);
+    job->scratch = (double*)gsf_alloc(ctx, job->scratch_size, (size_t)ctx->parallel.worker_count * sizeof(double));
+    const gsf_result result = job->sums && job->scratch ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) gsf__parallel_for(ctx, chunks, gsf__ssim_rows, job);
+    gsf_free(ctx, job->scratch);
+    return result;
+}
+
+// MS-SSIM is the product over scales of mean contrasts, and at the last one of the mean SSIM, each to the power of its
+// weight; means below 0 count as 0.
+
+enum { GSF__SSIM_SCALES = 5 };
+
+typedef struct gsf__halve_job {
+    const gsf_image *src, *dst; // f32, packed
+    int64_t left, top;          // 1: a line of zeros before the image
+} gsf__halve_job;
+
+static void gsf__halve_rows(void* arg, size_t chunk, int32_t worker) { // means of 2 x 2 pixels
+    const gsf__halve_job* job = (const gsf__halve_job*)arg;
+    const gsf_image *src = job->src, *dst = job->dst;
+    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
+    const int64_t channels = dst->channels;
+    (void)worker;
+    for (int64_t y = rows.begin; y < rows.end; y++)
+        for (int64_t x = 0; x < dst->width; x++)
+            for (int64_t c = 0; c < channels; c++) {
+                double sum = 0.0;
+                for (int k = 0; k < 4; k++) {
+                    const int64_t v = 2 * y + k / 2 - job->top, u = 2 * x + k % 2 - job->left;
+                    if (v >= 0 && u >= 0) sum += (double)((const float*)src->data)[(v * src->width + u) * channels + c];
+                }
+                ((float*)dst->data)[(y * dst->width + x) * channels + c] = (float)(sum / 4.0);
+            }
+}
+
+// Replaces a packed f32 image by one of half its size.
+static gsf_result gsf__halve_image(gsf_context* ctx, int pad, gsf_image* image) {
+    gsf__halve_job job;
+    gsf_image half;
+    job.left = pad ? image->width % 2 : 0;
+    job.top = pad ? image->height % 2 : 0;
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, (image->width + job.left) / 2, (image->height + job.top) / 2, image->channels,
+                            &half));
+    job.src = image;
+    job.dst = &half;
+    gsf__parallel_for(ctx, gsf__row_chunks(&half), gsf__halve_rows, &job);
+    gsf_destroy_image(ctx, image);
+    *image = half;
+    return GSF_OK;
+}
+
+// Multiplies the means of one scale into `products`: one per channel, or a single one for all.
+static gsf_result gsf__ssim_scale(gsf_context* ctx, gsf_ssim_kind kind, int scale, const gsf_image* a, const gsf_image* b,
+                                  double* products) {
+    static const double weights[GSF__SSIM_SCALES] = {0.0448, 0.2856, 0.3001, 0.2363, 0.1333};
+    gsf__ssim_job job;
+    gsf_result result = gsf__ssim_sum(ctx, kind, scale + 1 < GSF__SSIM_SCALES, a, b, NULL, &job);
+    const size_t groups = kind == GSF_SSIM_MULTISCALE ? (size_t)a->channels : 1;
+    const size_t chunks = job.chunks_per_channel * (size_t)a->channels / groups;
+    for (size_t i = 0; i < groups && result == GSF_OK; i++) {
+        double mean = 0.0;
+        result = gsf__metric_mean(ctx, "ms-ssim", job.sums + i * chunks, chunks, &mean);
+        products[i] *= pow(mean > 0.0 ? mean : 0.0, weights[scale]);
     }
     gsf_free(ctx, job.sums);
-    gsf_free(ctx, job.scratch);
+    return result;
+}
+
+static gsf_result gsf__ssim_multiscale(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
+                                       double* out) {
+    gsf_image pair[2];
+    const size_t groups = kind == GSF_SSIM_MULTISCALE ? (size_t)a->channels : 1;
+    double sum = 0.0, *products = (double*)gsf_alloc(ctx, groups, sizeof(double));
+    gsf_result result = products ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    memset(pair, 0, sizeof pair);
+    for (size_t i = 0; products && i < groups; i++) products[i] = 1.0;
+    for (int i = 0; i < 2 && result == GSF_OK; i++) {
+        result = gsf_make_image(ctx, GSF_F32, a->width, a->height, a->channels, &pair[i]);
+        if (result == GSF_OK) result = gsf_convert_image(ctx, i ? b : a, &pair[i]);
+    }
+    for (int scale = 0; scale < GSF__SSIM_SCALES && result == GSF_OK; scale++) {
+        for (int i = 0; i < 2 && scale > 0 && result == GSF_OK; i++)
+            result = gsf__halve_image(ctx, kind == GSF_SSIM_MULTISCALE, &pair[i]);
+        if (result == GSF_OK) result = gsf__ssim_scale(ctx, kind, scale, &pair[0], &pair[1], products);
+    }
+    for (size_t i = 0; i < groups && result == GSF_OK; i++) sum += products[i];
+    if (result == GSF_OK) *out = sum / (double)groups;
+    gsf_destroy_image(ctx, &pair[0]);
+    gsf_destroy_image(ctx, &pair[1]);
+    gsf_free(ctx, products);
+    return result;
+}
+
+GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
+                                    const gsf_image* mask, double* out) {
+    static const int64_t least[] = {1, 6, 7, 161, 176}; // of a side, by kind
+    gsf__ssim_job job;
+    GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));
+    if ((int)kind < 0 || (size_t)kind >= GSF__COUNT(least))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ssim: kind %d", (int)kind);
+    if (a->width < least[kind] || a->height < least[kind])
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
+                        (long long)a->height);
+    if (kind >= GSF_SSIM_MULTISCALE) {
+        if (mask) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ms-ssim: masks are not supported");
+        return gsf__ssim_multiscale(ctx, kind, a, b, out);
+    }
+    gsf_result result = gsf__ssim_sum(ctx, kind, 0, a, b, mask, &job);
+    if (result == GSF_OK)
+        result = gsf__metric_mean(ctx, "ssim", job.sums, job.chunks_per_channel * (size_t)a->channels, out);
+    gsf_free(ctx, job.sums);
     return result;
 }
 

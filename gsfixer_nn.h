@@ -617,27 +617,41 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
                    I2V background   the same, clip_vitb16_pretrain, open_clip_vitb16_pretrain, and ensemble_lora/ with
                                     adapter_model and adapter_config.json (DreamSim's dreamsim_ensemble_checkpoint)
                    motion           amt-s
-   CONVENTIONS Reported LPIPS values follow one of two: images scaled to [-1,1], as the lpips package documents it and as
-               gsplat's trainer uses AlexNet; or images in [0,1] taken as if they were in [-1,1] (`raw`), as 3DGS, GSFixer
-               and gsplat's trainer use VGG16. The values of the two cannot be compared.
+                   overall          ViClip-InternVid-10M-FLT, and bpe_simple_vocab_16e6.txt.gz (CLIP's list of merges)
+   CONVENTIONS Values of different conventions cannot be compared. The names are those of `gsfix metrics --which`.
+                   3DGS, GSFixer and papers with 3DGS's metrics.py    psnr, ssim_3dgs, lpips_vgg_raw
+                   gsplat's trainer                                   psnr, ssim_torchmetrics; lpips_alex, or with its option
+                                                                      for VGG16 lpips_vgg_raw
+                   the lpips package as documented (NeRF papers)      lpips_alex, lpips_vgg
+                   scikit-image with its defaults                     ssim_skimage
+                   VBench (I2V_SC, I2V_BC, OC, TF, MS in GSFixer)     i2v_subject, i2v_background, overall_consistency,
+                                                                      temporal_flickering, motion_smoothness
+               LPIPS: images are scaled to [-1,1], as the lpips package documents it; or images in [0,1] are taken as if they
+               were in [-1,1] (`raw`). GSFixer resizes restored frames to the size of the photos before it compares them
+               (bilinear, not antialiased), saves both with 8 bits, and averages per image, then per scene.
                I2V follows VBench with torchvision 0.17 or later: frames are resized with antialiasing. Motion needs frames
-               of at least 113 x 113 pixels; of an even number of frames the last is not used. */
+               of at least 113 x 113 pixels; of an even number of frames the last is not used. Overall consistency looks at 8
+               frames and the first 30 tokens of its text; GSFixer does not say which texts its table was made with. VBench
+               reads videos: the coding that GSFixer's have gone through changes flickering and smoothness. */
 
 typedef enum gsf_nn_metric_kind {
     GSF_NN_METRIC_LPIPS_ALEX = 0, GSF_NN_METRIC_LPIPS_VGG, GSF_NN_METRIC_LPIPS_SQUEEZE, // Zhang et al. 2018; low is good
     GSF_NN_METRIC_I2V_SUBJECT, GSF_NN_METRIC_I2V_BACKGROUND, // VBench's I2V_SC and I2V_BC: consistency with an input image
     GSF_NN_METRIC_MOTION_SMOOTHNESS, // VBench's MS: every second frame against one interpolated from its neighbours
+    GSF_NN_METRIC_OVERALL_CONSISTENCY, // VBench's OC: of a clip with its text
 } gsf_nn_metric_kind;
 
 typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when done
     gsf_nn_metric_kind kind;
     const char* models;        // folder with the weights; needed until the first frame has been measured
     int32_t raw;               // LPIPS: leave the images in [0,1]
+    const char* prompt;        // overall consistency: the text (UTF-8), read when the weights are opened
+    int64_t frames;            // overall consistency: of the clip, as which ones are looked at depends on it
     // results
     double score;              // of all frames so far. LPIPS: the mean. I2V: 0 before the second frame; motion: before the
-                               // third one
+                               // third one; overall consistency: before the last one
     double last;               // of the last frame. LPIPS: its distance. I2V: its similarity to the input image. Motion: the
-                               // last mean difference to an interpolated frame, 0 to 255
+                               // last mean difference to an interpolated frame, 0 to 255. Overall consistency: the score
     int64_t count;             // frames measured
     void* state;               // private
     const gsf__nn_tap* _tap;   // private
@@ -645,7 +659,7 @@ typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when d
 } gsf_nn_metric;
 
 // Measures the next frame, which has three channels. `reference`: for LPIPS its true image, of the same size; for I2V the
-// input image, of any size, which only the first frame needs; for motion NULL. The first call opens the weights; frame NULL
+// input image, of any size, which only the first frame needs; for the others NULL. The first call opens the weights; frame NULL
 // only does that. A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or infinity GSF_ERROR_NUMERIC,
 // frames that are too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
@@ -7222,6 +7236,7 @@ typedef struct gsf__vit { // pixels to tokens: a DINOv2
     gsf__nn_layer patches, norm;
     gsf__nn_layer pre_norm;        // CLIP: before the blocks
     const float *mean, *deviation; // of each channel of the pixels, for normalization; NULL: none
+    int dino;                      // positions are interpolated as in the first DINO
     gsf__nn_block* blocks;
 } gsf__vit;
 
@@ -7312,6 +7327,39 @@ static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* ent
 
 // ---- image encoders: from pixels to tokens
 
+// Weights of the four values around a coordinate, and the place of the first of them: PyTorch's bicubic interpolation
+// without antialiasing (a = -0.75). Places beyond the border take the value there.
+static int64_t gsf__cubic_taps(double at, double weights[4]) {
+    const double a = -0.75, first = floor(at), t = at - first;
+    for (int i = 0; i < 4; i++) {
+        const double x = fabs(t + 1.0 - (double)i);
+        weights[i] = x <= 1.0 ? ((a + 2.0) * x - (a + 3.0)) * x * x + 1.0 : ((a * x - 5.0 * a) * x + 8.0 * a) * x - 4.0 * a;
+    }
+    return (int64_t)first - 1;
+}
+
+static int64_t gsf__at_border(int64_t i, int64_t size) { return i < 0 ? 0 : gsf__least(i, size - 1); }
+
+// Patches' position embeddings as DINO interpolates them: its factor is that of a patch more by a tenth.
+static void gsf__vit_place_patches(const gsf__vit* vit, const float* square, int64_t down, int64_t across, float* out) {
+    const int64_t d = vit->sizes.width, grid = vit->grid;
+    const double sy = (double)grid / ((double)down + 0.1), sx = (double)grid / ((double)across + 0.1);
+    for (int64_t y = 0; y < down; y++)
+        for (int64_t x = 0; x < across; x++, out += d) {
+            double wy[4], wx[4];
+            const int64_t y0 = gsf__cubic_taps(((double)y + 0.5) * sy - 0.5, wy);
+            const int64_t x0 = gsf__cubic_taps(((double)x + 0.5) * sx - 0.5, wx);
+            for (int64_t i = 0; i < d; i++) {
+                double sum = 0.0;
+                for (int k = 0; k < 16; k++) {
+                    const int64_t row = gsf__at_border(y0 + k / 4, grid), column = gsf__at_border(x0 + k % 4, grid);
+                    sum += wy[k / 4] * wx[k % 4] * (double)square[(row * grid + column) * d + i];
+                }
+                out[i] = (float)sum;
+            }
+        }
+}
+
 // Position embeddings of the class token and of (down, across) patches, interpolated from the square grid of the file:
 // out (1 + patches, width). PyTorch's resampling (bicubic, antialias, align_corners=False) has the same weights as
 // Pillow's.
@@ -7327,7 +7375,9 @@ static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int6
     gsf_nn_convert_tensor(vit->positions, d, grid * grid * d, square);
     const gsf_image from = gsf_wrap_image(square, GSF_F32, grid, grid, (int32_t)d);
     const gsf_image to = gsf_wrap_image(out + d, GSF_F32, across, down, (int32_t)d);
-    const gsf_result result = gsf_resize_image(ctx, &from, GSF_RESIZE_PIL_BICUBIC, &to);
+    gsf_result result = GSF_OK;
+    if (vit->dino) gsf__vit_place_patches(vit, square, down, across, out + d);
+    else result = gsf_resize_image(ctx, &from, GSF_RESIZE_PIL_BICUBIC, &to);
     gsf_free(ctx, square);
     return result;
 }
@@ -8092,7 +8142,8 @@ typedef struct gsf__bpe_tables { // pointed to by gsf_nn_bpe.tables
     size_t added_capacity;
     int32_t vocabulary, added_count, by_id_count;
     int32_t bytes[256];      // tokens of single bytes, -1: none
-    int prefix_space, clean_up, split_special;
+    int32_t ends[256];       // the same for the last byte of a word, if marks_ends is set
+    int prefix_space, clean_up, split_special, marks_ends;
 } gsf__bpe_tables;
 
 // ---- bytes and characters
@@ -8284,11 +8335,9 @@ static gsf_result gsf__bpe_need_token(gsf__bpe_loader* l, int32_t line, const ch
 
 static int gsf__bpe_is_blank(char c) { return c == ' ' || c == '\t' || c == '\v' || c == '\f'; }
 
-// Parses one line; lines are numbered from 1. A blank line sets *found to 0.
-static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size_t size, int32_t number,
-                                      gsf__bpe_merge* out, int* found) {
-    const char* parts[2] = {NULL, NULL};
-    size_t sizes[2] = {0, 0}, count = 0;
+// Finds the first two words of a line; returns the number of all its words.
+static size_t gsf__bpe_split(const char* line, size_t size, const char* parts[2], size_t sizes[2]) {
+    size_t count = 0;
     for (size_t i = 0; i < size;) {
         if (gsf__bpe_is_blank(line[i])) {
             i++;
@@ -8302,6 +8351,15 @@ static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size
         }
         count++;
     }
+    return count;
+}
+
+// Parses one line; lines are numbered from 1. A blank line sets *found to 0.
+static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size_t size, int32_t number,
+                                      gsf__bpe_merge* out, int* found) {
+    const char* parts[2];
+    size_t sizes[2];
+    const size_t count = gsf__bpe_split(line, size, parts, sizes);
     *found = count == 2;
     if (count == 0) return GSF_OK;
     if (count != 2)
@@ -8316,11 +8374,24 @@ static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size
     return gsf__bpe_need_token(l, number, l->scratch.data, l->scratch.size, &out->result);
 }
 
+// Sorts the merges and fills t->first, which is zeroed; of two equal merges the later one wins.
+static void gsf__bpe_index_merges(gsf__bpe_tables* t, size_t count) {
+    size_t kept = 0;
+    if (count) qsort(t->merges, count, sizeof *t->merges, gsf__bpe_compare_merges);
+    for (size_t i = 0; i < count; i++) {
+        const gsf__bpe_merge* m = &t->merges[i];
+        if (i + 1 < count && m[1].left == m->left && m[1].right == m->right) continue;
+        t->first[m->left + 1]++;
+        t->merges[kept++] = *m;
+    }
+    for (int32_t i = 0; i < t->vocabulary; i++) t->first[i + 1] += t->first[i];
+}
+
 // Lines end in \n, \r\n or \r. As in transformers' GPT2Tokenizer the first line is always skipped as a comment, text
 // after the last line end is ignored, and of two equal merges the later one wins.
 static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, size_t size) {
     gsf__bpe_tables* t = l->t;
-    size_t lines = 0, count = 0, kept = 0;
+    size_t lines = 0, count = 0;
     for (size_t i = 0; i < size; i++) lines += text[i] == '\n' || text[i] == '\r';
     if (lines > INT32_MAX / 2) return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "merges.txt: %zu lines", lines);
     t->merges = (gsf__bpe_merge*)gsf_alloc(l->ctx, lines + 1, sizeof *t->merges);
@@ -8336,14 +8407,7 @@ static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, si
         if (text[i] == '\r' && i + 1 < size && text[i + 1] == '\n') i++;
         start = i + 1;
     }
-    if (count) qsort(t->merges, count, sizeof *t->merges, gsf__bpe_compare_merges);
-    for (size_t i = 0; i < count; i++) {
-        const gsf__bpe_merge* m = &t->merges[i];
-        if (i + 1 < count && m[1].left == m->left && m[1].right == m->right) continue;
-        t->first[m->left + 1]++;
-        t->merges[kept++] = *m;
-    }
-    for (int32_t i = 0; i < t->vocabulary; i++) t->first[i + 1] += t->first[i];
+    gsf__bpe_index_merges(t, count);
     return GSF_OK;
 }
 
@@ -8684,7 +8748,7 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
     GSF__TRY(gsf__bpe_place(run, size));
     run->heap_size = 0;
     for (int32_t i = 0; i < n; i++) {
-        run->symbols[i] = run->t->bytes[(unsigned char)word[i]];
+        run->symbols[i] = (run->t->marks_ends && i + 1 == n ? run->t->ends : run->t->bytes)[(unsigned char)word[i]];
         run->before[i] = i - 1;
         run->after[i] = i + 1 < n ? i + 1 : -1;
     }
@@ -8714,14 +8778,20 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
     return GSF_OK;
 }
 
-// Size in bytes of the first match of  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
-static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
+static size_t gsf__bpe_ending(const char* text, size_t size) { // of 's|'t|'re|'ve|'m|'ll|'d, or 0
     static const char* const endings[] = {"s", "t", "re", "ve", "m", "ll", "d"};
-    size_t step, last = 0;
     for (size_t i = 0; text[0] == '\'' && i < GSF__COUNT(endings); i++) {
         const size_t length = strlen(endings[i]);
         if (size > length && memcmp(text + 1, endings[i], length) == 0) return 1 + length;
     }
+    return 0;
+}
+
+// Size in bytes of the first match of  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
+static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
+    const size_t ending = gsf__bpe_ending(text, size);
+    size_t step, last = 0;
+    if (ending) return ending;
     size_t at = text[0] == ' ' && size > 1;
     const int kind = gsf__bpe_kind(t, text + at, size - at, &step);
     if (kind == GSF__BPE_SPACE) at = 0;
@@ -8904,6 +8974,444 @@ GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
     gsf_destroy_buffer(ctx, &bytes);
     if (failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; t->clean_up && i < GSF__COUNT(tidy); i++) gsf__bpe_replace(out, start, tidy[i][0], tidy[i][1]);
+    return GSF_OK;
+}
+
+// ---- bpe: CLIP's variant
+
+/* The tokenizer of CLIP (Radford et al. 2021; simple_tokenizer.py) and of ViCLIP. One file, bpe_simple_vocab_16e6.txt.gz or
+   the same without .gz: a line of comment, then lines "left right", lowest rank first; the first 48894 count. A symbol that
+   ends a word is spelled with "</w>" behind it. Ids number the 256 bytes, in the order of the characters that spell them;
+   the same at the end of a word; the results of the merges; the tokens that begin and end a text. A token that is spelled
+   like an earlier one replaces it.
+   Texts are cleaned first: the parts of ftfy.fix_text that a table can do (quotes, ligatures, full-width Latin letters,
+   characters of Windows-1252 in the place of control characters, other control characters), HTML entities twice, lower case.
+   Unlike ftfy, this neither repairs text that was decoded with the wrong encoding nor composes accents; of the named
+   entities it knows those of Latin-1, punctuation, &trade; and &euro;. */
+
+enum { GSF__CLIP_MERGES = 49152 - 256 - 2, GSF__CLIP_MOST = 1 << 16 }; // merges that count; bytes of a text
+
+typedef struct gsf__clip_bpe {
+    gsf__bpe_tables t;
+    int32_t begin, end; // ids
+} gsf__clip_bpe;
+
+static void gsf__clip_close(gsf_context* ctx, gsf__clip_bpe* bpe) {
+    gsf_free(ctx, bpe->t.strings);
+    gsf_free(ctx, bpe->t.tokens);
+    gsf_free(ctx, bpe->t.merges);
+    gsf_free(ctx, bpe->t.first);
+    gsf_free(ctx, bpe->t.kinds);
+}
+
+// Appends the token spelled `a` `b`, whose text goes to *at.
+static void gsf__clip_add(gsf__bpe_tables* t, char** at, const char* a, size_t a_size, const char* b, size_t b_size) {
+    gsf__bpe_token* token = &t->tokens[t->vocabulary];
+    token->text = *at;
+    token->size = a_size + b_size;
+    token->id = t->vocabulary++;
+    token->flags = 0;
+    memcpy(*at, a, a_size);
+    memcpy(*at + a_size, b, b_size);
+    (*at)[token->size] = 0;
+    *at += token->size + 1;
+}
+
+static int gsf__clip_compare_tokens(const void* a, const void* b) { // by text, then the latest first
+    const int order = gsf__bpe_compare_texts(a, b);
+    return order ? order : ((const gsf__bpe_token*)b)->id - ((const gsf__bpe_token*)a)->id;
+}
+
+typedef struct gsf__clip_lines { // walks the lines of merges
+    const char *text, *parts[2];
+    size_t size, at, sizes[2];
+    int32_t number; // of the current line, from 1
+} gsf__clip_lines;
+
+static gsf__clip_lines gsf__clip_begin_lines(const char* text, size_t size) {
+    gsf__clip_lines lines;
+    memset(&lines, 0, sizeof lines);
+    lines.text = text;
+    lines.size = size;
+    lines.number = 1;
+    while (lines.at < size && text[lines.at++] != '\n') { // the comment
+    }
+    return lines;
+}
+
+// Goes to the next line and returns 1, or 0 after the last one; *result is GSF_ERROR_FORMAT if it is not a merge.
+static int gsf__clip_next_line(gsf_context* ctx, const char* name, gsf__clip_lines* lines, gsf_result* result) {
+    size_t end = lines->at;
+    if (*result || lines->at >= lines->size || lines->number > GSF__CLIP_MERGES) return 0;
+    while (end < lines->size && lines->text[end] != '\n') end++;
+    const size_t size = end - lines->at - (end > lines->at && lines->text[end - 1] == '\r');
+    const size_t count = gsf__bpe_split(lines->text + lines->at, size, lines->parts, lines->sizes);
+    lines->number++;
+    lines->at = end + 1;
+    if (count == 2) return 1;
+    *result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%d: %zu tokens, not two", name, (int)lines->number, count);
+    return 0;
+}
+
+// Makes the vocabulary, sorted by text. *merged: the first result of a merge; the others follow it in memory.
+static gsf_result gsf__clip_make_tokens(gsf_context* ctx, const char* name, const char* text, size_t size, gsf__clip_bpe* bpe,
+                                        const char** merged) {
+    gsf__bpe_tables* t = &bpe->t;
+    gsf__clip_lines lines = gsf__clip_begin_lines(text, size);
+    gsf_result result = GSF_OK;
+    size_t count = 0, kept = 0;
+    for (size_t i = 0; i < size; i++) count += text[i] == '\n';
+    count = count < (size_t)GSF__CLIP_MERGES ? count + 1 : (size_t)GSF__CLIP_MERGES;
+    t->strings = (char*)gsf_alloc(ctx, size + count + 512 * 8 + 64, 1);
+    t->tokens = (gsf__bpe_token*)gsf_alloc(ctx, count + 514, sizeof *t->tokens);
+    if (!t->strings || !t->tokens) return GSF_ERROR_OUT_OF_MEMORY;
+    char* at = t->strings;
+    for (int ends = 0; ends < 2; ends++)
+        for (uint32_t character = 0; character < 324; character++) {
+            char symbol[2];
+            if (gsf__bpe_byte(character) < 0) continue;
+            gsf__clip_add(t, &at, symbol, gsf__bpe_store_character(character, symbol), "</w>", ends ? 4 : 0);
+        }
+    *merged = at;
+    while (gsf__clip_next_line(ctx, name, &lines, &result))
+        gsf__clip_add(t, &at, lines.parts[0], lines.sizes[0], lines.parts[1], lines.sizes[1]);
+    bpe->begin = t->vocabulary;
+    gsf__clip_add(t, &at, "<|startoftext|>", 15, "", 0);
+    bpe->end = t->vocabulary;
+    gsf__clip_add(t, &at, "<|endoftext|>", 13, "", 0);
+    qsort(t->tokens, (size_t)t->vocabulary, sizeof *t->tokens, gsf__clip_compare_tokens);
+    for (size_t i = 0; i < (size_t)t->vocabulary; i++)
+        if (kept == 0 || gsf__bpe_compare_texts(&t->tokens[i], &t->tokens[kept - 1]) != 0) t->tokens[kept++] = t->tokens[i];
+    t->vocabulary = (int32_t)kept;
+    return result;
+}
+
+static gsf_result gsf__clip_make_merges(gsf_context* ctx, const char* name, const char* text, size_t size, const char* merged,
+                                        gsf__bpe_tables* t) {
+    gsf__clip_lines lines = gsf__clip_begin_lines(text, size);
+    gsf_result result = GSF_OK;
+    size_t count = 0;
+    t->merges = (gsf__bpe_merge*)gsf_alloc(ctx, GSF__CLIP_MERGES, sizeof *t->merges);
+    t->first = (int32_t*)gsf_alloc_zeroed(ctx, (size_t)t->vocabulary + 1, sizeof *t->first);
+    if (!t->merges || !t->first) return GSF_ERROR_OUT_OF_MEMORY;
+    while (gsf__clip_next_line(ctx, name, &lines, &result)) {
+        gsf__bpe_merge* m = &t->merges[count++];
+        int32_t* const ids[2] = {&m->left, &m->right};
+        for (int i = 0; i < 2 && !result; i++) {
+            char shown[64];
+            *ids[i] = gsf__bpe_find(t, lines.parts[i], lines.sizes[i]);
+            if (*ids[i] >= 0) continue;
+            snprintf(shown, sizeof shown, "%.*s", lines.sizes[i] < 60 ? (int)lines.sizes[i] : 60, lines.parts[i]);
+            result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%d: %s is no token", name, (int)lines.number,
+                              gsf__nn_show(shown).text);
+        }
+        m->rank = lines.number;
+        m->result = gsf__bpe_find(t, merged, lines.sizes[0] + lines.sizes[1]);
+        merged += lines.sizes[0] + lines.sizes[1] + 1;
+    }
+    if (!result) gsf__bpe_index_merges(t, count);
+    return result;
+}
+
+// Opens FOLDER/bpe_simple_vocab_16e6.txt.gz or .txt; the caller closes *bpe, also on error.
+static gsf_result gsf__clip_open(gsf_context* ctx, const char* folder, gsf__clip_bpe* bpe) {
+    static const char* const names[2] = {"bpe_simple_vocab_16e6.txt.gz", "bpe_simple_vocab_16e6.txt"};
+    const char *name = names[0], *merged = NULL;
+    gsf__bpe_tables* t = &bpe->t;
+    gsf_buffer path;
+    void* data = NULL;
+    size_t size = 0;
+    gsf_result result = GSF_ERROR_NOT_FOUND;
+    for (int i = 0; i < 2 && result == GSF_ERROR_NOT_FOUND; i++) {
+        name = names[i];
+        result = gsf__nn_join(ctx, folder, name, &path);
+        if (!result) result = gsf_read_file(ctx, path.data, &data, &size);
+        gsf_destroy_buffer(ctx, &path);
+    }
+    if (result == GSF_ERROR_NOT_FOUND)
+        return gsf_fail(ctx, result, "%s: neither %s nor the same without .gz is there", folder, names[0]);
+    if (!result && size >= 2 && memcmp(data, "\x1f\x8b", 2) == 0) {
+        unsigned char* text;
+        result = gsf__gzip_read(ctx, name, (const unsigned char*)data, size, &text, &size);
+        gsf_free(ctx, data);
+        data = text;
+    }
+    if (!result && size > INT32_MAX / 2) result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes", name, size);
+    if (!result) result = gsf__bpe_unpack_kinds(ctx, t);
+    if (!result) result = gsf__clip_make_tokens(ctx, name, (const char*)data, size, bpe, &merged);
+    if (!result) result = gsf__clip_make_merges(ctx, name, (const char*)data, size, merged, t);
+    gsf_free(ctx, data);
+    for (unsigned byte = 0; byte < 256 && !result; byte++) {
+        char symbol[8];
+        const size_t length = gsf__bpe_store_character(gsf__bpe_character(byte), symbol);
+        t->bytes[byte] = gsf__bpe_find(t, symbol, length);
+        memcpy(symbol + length, "</w>", 4);
+        t->ends[byte] = gsf__bpe_find(t, symbol, length + 4);
+    }
+    t->marks_ends = 1;
+    return result;
+}
+
+// ---- bpe: cleaning CLIP's texts
+
+typedef struct gsf__clip_case { uint32_t first, count, step; int32_t delta; } gsf__clip_case;
+
+// Lower case of single characters (Unicode 14.0): for first, first + step, ..., the lower case is `delta` away. Generated by
+//     runs = []
+//     for c in range(0x110000):
+//         d = ord(chr(c).lower()) - c if len(chr(c).lower()) == 1 else 0
+//         if d and runs and runs[-1][3] == d and (c - runs[-1][0] == runs[-1][1] * runs[-1][2] or
+//                                                 runs[-1][1] == 1 and c - runs[-1][0] == 2):
+//             runs[-1][1:3] = runs[-1][1] + 1, (c - runs[-1][0]) // runs[-1][1]
+//         elif d:
+//             runs.append([c, 1, 1, d])
+static const gsf__clip_case gsf__clip_cases[] = {
+    {65, 26, 1, 32}, {192, 23, 1, 32}, {216, 7, 1, 32}, {256, 24, 2, 1}, {306, 3, 2, 1}, {313, 8, 2, 1},
+    {330, 23, 2, 1}, {376, 1, 1, -121}, {377, 3, 2, 1}, {385, 1, 1, 210}, {386, 2, 2, 1}, {390, 1, 1, 206},
+    {391, 1, 1, 1}, {393, 2, 1, 205}, {395, 1, 1, 1}, {398, 1, 1, 79}, {399, 1, 1, 202}, {400, 1, 1, 203},
+    {401, 1, 1, 1}, {403, 1, 1, 205}, {404, 1, 1, 207}, {406, 1, 1, 211}, {407, 1, 1, 209}, {408, 1, 1, 1},
+    {412, 1, 1, 211}, {413, 1, 1, 213}, {415, 1, 1, 214}, {416, 3, 2, 1}, {422, 1, 1, 218}, {423, 1, 1, 1},
+    {425, 1, 1, 218}, {428, 1, 1, 1}, {430, 1, 1, 218}, {431, 1, 1, 1}, {433, 2, 1, 217}, {435, 2, 2, 1},
+    {439, 1, 1, 219}, {440, 1, 1, 1}, {444, 1, 1, 1}, {452, 1, 1, 2}, {453, 1, 1, 1}, {455, 1, 1, 2}, {456, 1, 1, 1},
+    {458, 1, 1, 2}, {459, 9, 2, 1}, {478, 9, 2, 1}, {497, 1, 1, 2}, {498, 2, 2, 1}, {502, 1, 1, -97}, {503, 1, 1, -56},
+    {504, 20, 2, 1}, {544, 1, 1, -130}, {546, 9, 2, 1}, {570, 1, 1, 10795}, {571, 1, 1, 1}, {573, 1, 1, -163},
+    {574, 1, 1, 10792}, {577, 1, 1, 1}, {579, 1, 1, -195}, {580, 1, 1, 69}, {581, 1, 1, 71}, {582, 5, 2, 1},
+    {880, 2, 2, 1}, {886, 1, 1, 1}, {895, 1, 1, 116}, {902, 1, 1, 38}, {904, 3, 1, 37}, {908, 1, 1, 64},
+    {910, 2, 1, 63}, {913, 17, 1, 32}, {931, 9, 1, 32}, {975, 1, 1, 8}, {984, 12, 2, 1}, {1012, 1, 1, -60},
+    {1015, 1, 1, 1}, {1017, 1, 1, -7}, {1018, 1, 1, 1}, {1021, 3, 1, -130}, {1024, 16, 1, 80}, {1040, 32, 1, 32},
+    {1120, 17, 2, 1}, {1162, 27, 2, 1}, {1216, 1, 1, 15}, {1217, 7, 2, 1}, {1232, 48, 2, 1}, {1329, 38, 1, 48},
+    {4256, 38, 1, 7264}, {4295, 1, 1, 7264}, {4301, 1, 1, 7264}, {5024, 80, 1, 38864}, {5104, 6, 1, 8},
+    {7312, 43, 1, -3008}, {7357, 3, 1, -3008}, {7680, 75, 2, 1}, {7838, 1, 1, -7615}, {7840, 48, 2, 1},
+    {7944, 8, 1, -8}, {7960, 6, 1, -8}, {7976, 8, 1, -8}, {7992, 8, 1, -8}, {8008, 6, 1, -8}, {8025, 4, 2, -8},
+    {8040, 8, 1, -8}, {8072, 8, 1, -8}, {8088, 8, 1, -8}, {8104, 8, 1, -8}, {8120, 2, 1, -8}, {8122, 2, 1, -74},
+    {8124, 1, 1, -9}, {8136, 4, 1, -86}, {8140, 1, 1, -9}, {8152, 2, 1, -8}, {8154, 2, 1, -100}, {8168, 2, 1, -8},
+    {8170, 2, 1, -112}, {8172, 1, 1, -7}, {8184, 2, 1, -128}, {8186, 2, 1, -126}, {8188, 1, 1, -9}, {8486, 1, 1, -7517},
+    {8490, 1, 1, -8383}, {8491, 1, 1, -8262}, {8498, 1, 1, 28}, {8544, 16, 1, 16}, {8579, 1, 1, 1}, {9398, 26, 1, 26},
+    {11264, 48, 1, 48}, {11360, 1, 1, 1}, {11362, 1, 1, -10743}, {11363, 1, 1, -3814}, {11364, 1, 1, -10727},
+    {11367, 3, 2, 1}, {11373, 1, 1, -10780}, {11374, 1, 1, -10749}, {11375, 1, 1, -10783}, {11376, 1, 1, -10782},
+    {11378, 1, 1, 1}, {11381, 1, 1, 1}, {11390, 2, 1, -10815}, {11392, 50, 2, 1}, {11499, 2, 2, 1}, {11506, 1, 1, 1},
+    {42560, 23, 2, 1}, {42624, 14, 2, 1}, {42786, 7, 2, 1}, {42802, 31, 2, 1}, {42873, 2, 2, 1}, {42877, 1, 1, -35332},
+    {42878, 5, 2, 1}, {42891, 1, 1, 1}, {42893, 1, 1, -42280}, {42896, 2, 2, 1}, {42902, 10, 2, 1},
+    {42922, 1, 1, -42308}, {42923, 1, 1, -42319}, {42924, 1, 1, -42315}, {42925, 1, 1, -42305}, {42926, 1, 1, -42308},
+    {42928, 1, 1, -42258}, {42929, 1, 1, -42282}, {42930, 1, 1, -42261}, {42931, 1, 1, 928}, {42932, 8, 2, 1},
+    {42948, 1, 1, -48}, {42949, 1, 1, -42307}, {42950, 1, 1, -35384}, {42951, 2, 2, 1}, {42960, 1, 1, 1},
+    {42966, 2, 2, 1}, {42997, 1, 1, 1}, {65313, 26, 1, 32}, {66560, 40, 1, 40}, {66736, 36, 1, 40}, {66928, 11, 1, 39},
+    {66940, 15, 1, 39}, {66956, 7, 1, 39}, {66964, 2, 1, 39}, {68736, 51, 1, 64}, {71840, 32, 1, 32},
+    {93760, 32, 1, 32}, {125184, 34, 1, 34},
+};
+
+static uint32_t gsf__clip_lower(uint32_t character) {
+    size_t low = 0, high = GSF__COUNT(gsf__clip_cases);
+    while (high - low > 1) { // the last run that does not begin behind it
+        const size_t middle = (low + high) / 2;
+        if (gsf__clip_cases[middle].first <= character) low = middle;
+        else high = middle;
+    }
+    const gsf__clip_case* run = &gsf__clip_cases[low];
+    const uint32_t past = character - run->first;
+    const int inside = character >= run->first && past / run->step < run->count && past % run->step == 0;
+    return inside ? (uint32_t)((int32_t)character + run->delta) : character;
+}
+
+static void gsf__clip_put(gsf_context* ctx, gsf_buffer* out, uint32_t character) {
+    char bytes[4];
+    if (character < 0x800) {
+        gsf_append_bytes(ctx, out, bytes, gsf__bpe_store_character(character, bytes));
+        return;
+    }
+    const size_t size = character < 0x10000 ? 3 : 4;
+    for (size_t i = size - 1; i > 0; i--, character >>= 6) bytes[i] = (char)(0x80 | (character & 0x3f));
+    bytes[0] = (char)((size == 3 ? 0xe0 : 0xf0) | character);
+    gsf_append_bytes(ctx, out, bytes, size);
+}
+
+static const uint16_t gsf__clip_windows[32] = { // 0x80 ... 0x9f in Windows-1252
+    0x20ac, 0x81, 0x201a, 0x192, 0x201e, 0x2026, 0x2020, 0x2021, 0x2c6, 0x2030, 0x160, 0x2039, 0x152, 0x8d, 0x17d, 0x8f,
+    0x90, 0x2018, 0x2019, 0x201c, 0x201d, 0x2022, 0x2013, 0x2014, 0x2dc, 0x2122, 0x161, 0x203a, 0x153, 0x9d, 0x17e, 0x178,
+};
+
+static const char gsf__clip_entities[] = // of U+00A0 ... U+00FF in order; then of those in gsf__clip_others
+    "nbsp iexcl cent pound curren yen brvbar sect uml copy ordf laquo not shy reg macr deg plusmn sup2 sup3 acute micro para "
+    "middot cedil sup1 ordm raquo frac14 frac12 frac34 iquest Agrave Aacute Acirc Atilde Auml Aring AElig Ccedil Egrave "
+    "Eacute Ecirc Euml Igrave Iacute Icirc Iuml ETH Ntilde Ograve Oacute Ocirc Otilde Ouml times Oslash Ugrave Uacute Ucirc "
+    "Uuml Yacute THORN szlig agrave aacute acirc atilde auml aring aelig ccedil egrave eacute ecirc euml igrave iacute icirc "
+    "iuml eth ntilde ograve oacute ocirc otilde ouml divide oslash ugrave uacute ucirc uuml yacute thorn yuml amp lt gt quot "
+    "apos ndash mdash lsquo rsquo sbquo ldquo rdquo bdquo bull hellip trade euro ";
+static const uint16_t gsf__clip_others[] = {'&', '<', '>', '"', '\'', 0x2013, 0x2014, 0x2018, 0x2019, 0x201a, 0x201c, 0x201d,
+                                            0x201e, 0x2022, 0x2026, 0x2122, 0x20ac};
+enum { GSF__CLIP_OLD = 96 + 4 }; // HTML knows the first ones without a semicolon, too
+
+// The named entity at `name` (behind the "&"): its character, and its size. Without a semicolon it is the longest known name.
+static uint32_t gsf__clip_named(const char* name, size_t left, size_t* size) {
+    uint32_t found = 0, index = 0;
+    size_t length = 0, best = 0;
+    while (length < left && length < 32 && ((name[length] >= 'a' && name[length] <= 'z') ||
+                                            (name[length] >= 'A' && name[length] <= 'Z') ||
+                                            (name[length] >= '0' && name[length] <= '9')))
+        length++;
+    const int closed = length < left && name[length] == ';';
+    for (const char* p = gsf__clip_entities; *p; index++) {
+        const size_t n = (size_t)(strchr(p, ' ') - p);
+        const int fits = closed ? n == length : n <= length && n > best && index < GSF__CLIP_OLD;
+        if (fits && memcmp(p, name, n) == 0) {
+            best = n;
+            found = index < 96 ? 0xa0 + index : gsf__clip_others[index - 96];
+        }
+        p += n + 1;
+    }
+    *size = best + (closed && best);
+    return found;
+}
+
+static uint32_t gsf__clip_number(const char* text, size_t left, size_t* size) { // what follows "&#"
+    const int hex = left > 0 && (text[0] == 'x' || text[0] == 'X');
+    size_t at = (size_t)hex;
+    uint32_t value = 0;
+    for (; at < left; at++) {
+        const char c = text[at];
+        const int digit = c >= '0' && c <= '9' ? c - '0' : hex && (c | 32) >= 'a' && (c | 32) <= 'f' ? (c | 32) - 'a' + 10 : -1;
+        if (digit < 0) break;
+        if (value <= 0x110000) value = value * (hex ? 16 : 10) + (uint32_t)digit;
+    }
+    *size = at == (size_t)hex ? 0 : at + (at < left && text[at] == ';');
+    if (value >= 0x80 && value <= 0x9f) return gsf__clip_windows[value - 0x80];
+    return value == 0 || value > 0x10ffff || (value >= 0xd800 && value <= 0xdfff) ? 0xfffd : value;
+}
+
+static int gsf__clip_is_control(uint32_t c) {
+    return c < 9 || c == 11 || (c >= 14 && c < 32) || c == 127 || (c >= 0x206a && c <= 0x206f) || c == 0xfeff ||
+           (c >= 0xfff9 && c <= 0xfffb);
+}
+
+// Replaces entities, as Python's html.unescape does it, or only those with a semicolon; returns whether there were any.
+static int gsf__clip_unescape(gsf_context* ctx, const char* text, size_t size, int closed, gsf_buffer* out) {
+    int found = 0;
+    for (size_t i = 0, taken; i < size; i += taken) {
+        const int number = text[i] == '&' && i + 1 < size && text[i + 1] == '#';
+        const size_t head = number ? 2 : 1;
+        uint32_t character = 0;
+        taken = 0;
+        if (number) character = gsf__clip_number(text + i + head, size - i - head, &taken);
+        else if (text[i] == '&') character = gsf__clip_named(text + i + head, size - i - head, &taken);
+        if (taken && closed && text[i + head + taken - 1] != ';') taken = 0;
+        if (taken) {
+            taken += head;
+            found = 1;
+            if (!number || !gsf__clip_is_control(character)) gsf__clip_put(ctx, out, character);
+        } else {
+            taken = gsf__utf8_size(text + i, size - i);
+            gsf_append_bytes(ctx, out, text + i, taken);
+        }
+    }
+    return found;
+}
+
+// What ftfy does to single characters.
+static void gsf__clip_fix(gsf_context* ctx, const char* text, size_t size, gsf_buffer* out) {
+    static const struct { uint32_t from; const char* to; } ligatures[] = {
+        {0x132, "IJ"}, {0x133, "ij"}, {0x149, "'n"}, {0x1c4, "D\xc5\xbd"}, {0x1c5, "D\xc5\xbe"}, {0x1c6, "d\xc5\xbe"},
+        {0x1c7, "LJ"}, {0x1c8, "Lj"}, {0x1c9, "lj"}, {0x1ca, "NJ"}, {0x1cb, "Nj"}, {0x1cc, "nj"}, {0x1f1, "DZ"},
+        {0x1f2, "Dz"}, {0x1f3, "dz"}, {0xfb00, "ff"}, {0xfb01, "fi"}, {0xfb02, "fl"}, {0xfb03, "ffi"}, {0xfb04, "ffl"},
+        {0xfb05, "\xc5\xbft"}, {0xfb06, "st"}};
+    for (size_t i = 0, step; i < size; i += step) {
+        step = gsf__utf8_size(text + i, size - i);
+        uint32_t c = gsf__bpe_load_character(text + i, step);
+        const char* parts = NULL;
+        if (c >= 0x80 && c <= 0x9f) c = gsf__clip_windows[c - 0x80];
+        for (size_t k = 0; c >= 0x132 && k < GSF__COUNT(ligatures); k++)
+            if (ligatures[k].from == c) parts = ligatures[k].to;
+        if (c >= 0xff01 && c <= 0xff5e) c -= 0xfee0;
+        else if (c == 0x3000) c = ' ';
+        if (c == 0x2bc || (c >= 0x2018 && c <= 0x201b)) c = '\'';
+        else if (c >= 0x201c && c <= 0x201f) c = '"';
+        if (parts) gsf_append_bytes(ctx, out, parts, strlen(parts));
+        else if (!gsf__clip_is_control(c)) gsf__clip_put(ctx, out, c);
+    }
+}
+
+// Python's str.lower, where a sigma at the end of a word has a form of its own.
+static void gsf__clip_lower_text(gsf_context* ctx, const gsf__bpe_tables* t, const char* text, size_t size, gsf_buffer* out) {
+    int letter = 0; // the character before this one is
+    for (size_t i = 0, step, next; i < size; i += step) {
+        const int kind = gsf__bpe_kind(t, text + i, size - i, &step);
+        const uint32_t c = gsf__bpe_load_character(text + i, step);
+        const int more = i + step < size && gsf__bpe_kind(t, text + i + step, size - i - step, &next) == GSF__BPE_LETTER;
+        if (c == 0x130) gsf_append_bytes(ctx, out, "i\xcc\x87", 3);
+        else gsf__clip_put(ctx, out, c == 0x3a3 && letter && !more ? 0x3c2 : gsf__clip_lower(c));
+        letter = kind == GSF__BPE_LETTER;
+    }
+}
+
+static gsf_result gsf__clip_clean(gsf_context* ctx, const gsf__clip_bpe* bpe, const char* text, gsf_buffer* out) {
+    const size_t size = strlen(text);
+    const int plain = strchr(text, '<') == NULL; // for ftfy, text with "<" is not escaped
+    gsf_buffer rooms[2]; // the text now, and the text next
+    int again = 1, failed = 0;
+    memset(rooms, 0, sizeof rooms);
+    memset(out, 0, sizeof *out);
+    if (size > GSF__CLIP_MOST) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "a prompt of %zu bytes", size);
+    for (size_t i = 0, step; i < size; i += step) {
+        step = gsf__utf8_size(text + i, size - i);
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "prompt:%zu: byte 0x%02x is not valid UTF-8", i,
+                                   (unsigned)(unsigned char)text[i]);
+    }
+    gsf_append_bytes(ctx, &rooms[0], text, size);
+    for (int pass = 0; pass < 3 && !failed; pass += !again) { // ftfy until nothing changes, then html.unescape twice
+        rooms[1].size = 0;
+        gsf_append_bytes(ctx, &rooms[1], "", 0);
+        again = 0;
+        if (pass || plain) again = gsf__clip_unescape(ctx, rooms[0].data, rooms[0].size, pass == 0, &rooms[1]);
+        else gsf_append_bytes(ctx, &rooms[1], rooms[0].data, rooms[0].size);
+        if (pass) again = 0;
+        rooms[0].size = 0;
+        if (pass == 0) gsf__clip_fix(ctx, rooms[1].data, rooms[1].size, &rooms[0]);
+        else gsf_append_bytes(ctx, &rooms[0], rooms[1].data, rooms[1].size);
+        failed = rooms[0].failed || rooms[1].failed;
+    }
+    if (!failed) gsf__clip_lower_text(ctx, &bpe->t, rooms[0].data, rooms[0].size, out);
+    failed |= out->failed;
+    gsf_destroy_buffer(ctx, &rooms[0]);
+    gsf_destroy_buffer(ctx, &rooms[1]);
+    return failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+// Size in bytes of the first match of  's|'t|'re|'ve|'m|'ll|'d|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+ ; the text begins with one.
+static size_t gsf__clip_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
+    const size_t ending = gsf__bpe_ending(text, size);
+    size_t at, step;
+    if (ending) return ending;
+    const int kind = gsf__bpe_kind(t, text, size, &at);
+    while (kind != GSF__BPE_NUMBER && at < size && gsf__bpe_kind(t, text + at, size - at, &step) == kind) at += step;
+    return at;
+}
+
+// The ids of a text without those that begin and end it; free *ids with gsf_free.
+static gsf_result gsf__clip_encode(gsf_context* ctx, const gsf__clip_bpe* bpe, const char* text, int32_t** ids, size_t* count) {
+    static const char* const marks[2] = {"<|startoftext|>", "<|endoftext|>"};
+    gsf__bpe_run run;
+    gsf_buffer clean;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.t = &bpe->t;
+    run.unk = -1;
+    *ids = NULL;
+    *count = 0;
+    gsf_result result = gsf__clip_clean(ctx, bpe, text, &clean);
+    for (size_t at = 0, step; at < clean.size && !result; at += step) {
+        const char* p = clean.data + at;
+        const size_t left = clean.size - at;
+        int mark = 0;
+        if (gsf__bpe_kind(run.t, p, left, &step) == GSF__BPE_SPACE) continue;
+        while (mark < 2 && (left < strlen(marks[mark]) || memcmp(p, marks[mark], strlen(marks[mark])) != 0)) mark++;
+        step = mark < 2 ? strlen(marks[mark]) : gsf__clip_next_word(run.t, p, left);
+        result = mark < 2 ? gsf__nn_emit(ctx, &run.out, mark ? bpe->end : bpe->begin) : gsf__bpe_word(&run, p, step);
+    }
+    gsf_destroy_buffer(ctx, &clean);
+    gsf_free(ctx, run.scratch);
+    if (result) gsf_free(ctx, run.out.ids);
+    if (result) return result;
+    *ids = run.out.ids;
+    *count = run.out.count;
     return GSF_OK;
 }
 
@@ -14438,8 +14946,9 @@ static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima
         for (int64_t v = y0; v < y1; v++)
             for (int64_t u = x0; u < x1; u++) {
                 const float* from = x->data + ((image * x->height + v) * x->width + u) * c;
-                const int first = v == y0 && u == x0;
-                for (int64_t i = 0; i < c; i++) out[i] = first || !(from[i] <= out[i]) ? from[i] : out[i];
+                if (v == y0 && u == x0) memcpy(out, from, (size_t)c * sizeof(float));
+                else
+                    for (int64_t i = 0; i < c; i++) out[i] = from[i] <= out[i] ? out[i] : from[i]; // a NaN remains
             }
     }
 }
@@ -14661,6 +15170,7 @@ static gsf_result gsf__tower_bind(gsf__nn_loader* loader, const gsf__tower_form*
     vit->sizes.eps = form->eps;
     vit->sizes.activation = form->activation;
     vit->sizes.qkv_bias = 1;
+    vit->dino = 1;
     vit->block_names = "blocks.";
     vit->prefix = "patch_embed.";
     vit->mean = form->mean;
@@ -15756,6 +16266,355 @@ static gsf_result gsf__amt_measure(gsf_context* ctx, gsf_nn_metric* metric, cons
     return GSF_OK;
 }
 
+// ---- metrics: overall consistency (VBench)
+
+/* ViCLIP (Wang et al. 2023, InternVid; VBench third_party/ViCLIP): the cosine between the features of a clip and of a text.
+   The vision transformer sees frames from the middles of as many equal parts of the clip as it has positions in time (8), all
+   at once: a class token, then for each patch its frames in order. Frames have their shorter side resized to the transformer's
+   (224), bicubic with a = -0.75, not antialiased, in 8 bits, and are cut at the centre. The text transformer is causal, and
+   the text's feature is that of the token that ends it, so that the padding behind it is not computed. */
+
+enum { GSF__VICLIP_MOST = 64 }; // frames that the transformer sees
+
+typedef struct gsf__viclip_tower {
+    gsf__nn_block_sizes sizes;
+    int64_t layers;
+    const char* names; // of the blocks
+    gsf__nn_block* blocks;
+} gsf__viclip_tower;
+
+typedef struct gsf__viclip {
+    gsf_nn_weights weights;
+    gsf__viclip_tower vision, text;
+    const gsf_nn_tensor *class_token, *places, *times, *projection; // times: (1, samples, width)
+    gsf__nn_layer patches, pre_norm, norm;
+    const gsf_nn_tensor *tokens, *text_places, *text_projection; // text_places: (context, width)
+    gsf__nn_layer text_norm;
+    int64_t patch, grid, samples, context, vocabulary, features;
+    gsf__clip_bpe bpe;
+    float *pixels, *feature; // (samples, 3, side, side) in [0,1]; (2, features): of the text, of the clip
+} gsf__viclip;
+
+static const gsf__nn_entry gsf__viclip_block_entries[] = { // below *_encoder.transformer.resblocks.N.
+    {"ln_1", "d", GSF__NN_BLOCK(norm1)},
+    {"ln_2", "d", GSF__NN_BLOCK(norm2)},
+    {"attn.in_proj_weight", "td", GSF__NN_BLOCK_AS(qkv.weight, GSF__NN_TENSOR, 0)},
+    {"attn.in_proj_bias", "t", GSF__NN_BLOCK_AS(qkv.bias, GSF__NN_TENSOR, 0)},
+    {"attn.out_proj", "dd", GSF__NN_BLOCK(out)},
+    {"mlp.c_fc", "md", GSF__NN_BLOCK(up)},
+    {"mlp.c_proj", "dm", GSF__NN_BLOCK(down)},
+    GSF__NN_END,
+};
+
+// Letters: d, p, s, f, e width, patch, positions, samples and features of the vision transformer; w, c, v width, positions
+// and vocabulary of the text's.
+#define GSF__VICLIP_TENSOR(member) offsetof(gsf__viclip, member), GSF__NN_TENSOR, 0
+static const gsf__nn_entry gsf__viclip_entries[] = {
+    {"vision_encoder.class_embedding", "d", GSF__VICLIP_TENSOR(class_token)},
+    {"vision_encoder.positional_embedding", "sd", GSF__VICLIP_TENSOR(places)},
+    {"vision_encoder.temporal_positional_embedding", "1fd", GSF__VICLIP_TENSOR(times)},
+    {"vision_encoder.conv1", "d31pp", offsetof(gsf__viclip, patches), GSF__NN_WEIGHT, 0},
+    {"vision_encoder.ln_pre", "d", GSF__NN_AT(gsf__viclip, pre_norm)},
+    {"vision_encoder.ln_post", "d", GSF__NN_AT(gsf__viclip, norm)},
+    {"vision_encoder.proj", "de", GSF__VICLIP_TENSOR(projection)},
+    {"text_encoder.token_embedding", "vw", offsetof(gsf__viclip, tokens), GSF__NN_WEIGHT, 0},
+    {"text_encoder.positional_embedding", "cw", GSF__VICLIP_TENSOR(text_places)},
+    {"text_encoder.ln_final", "w", GSF__NN_AT(gsf__viclip, text_norm)},
+    {"text_encoder.text_projection", "we", GSF__VICLIP_TENSOR(text_projection)},
+    GSF__NN_END,
+};
+#undef GSF__VICLIP_TENSOR
+
+static gsf_result gsf__viclip_bind_blocks(gsf__nn_loader* loader, int64_t width, int32_t heads, const char* names,
+                                          gsf__viclip_tower* tower) {
+    static const int64_t any[2] = {-1, -1};
+    const gsf_nn_tensor* up;
+    gsf__nn_block_sizes* s = &tower->sizes;
+    GSF__TRY(gsf__nn_need(loader, &up, 2, any, "%s0.mlp.c_fc.weight", names));
+    tower->names = names;
+    tower->layers = gsf__nn_count_blocks(loader->weights, names);
+    s->width = width;
+    s->mlp = up->shape[0];
+    s->heads = heads ? heads : (int32_t)gsf__least(width / 64, 4096);
+    s->eps = 1e-5f;
+    s->activation = GSF__NN_QUICK_GELU;
+    s->qkv_bias = 1;
+    if (s->heads < 1 || width % s->heads || width >= 1 << 16 || s->mlp < 1)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s: %d heads of a width of %lld", loader->weights->name,
+                        up->name, (int)s->heads, (long long)width);
+    s->head_dim = (int32_t)(width / s->heads);
+    return gsf__nn_bind_blocks(loader, s, gsf__viclip_block_entries, names, tower->layers, &tower->blocks);
+}
+
+static gsf_result gsf__viclip_bind(gsf__nn_loader* loader, const int32_t* heads, gsf__viclip* net) {
+    static const int64_t any[5] = {-1, -1, -1, -1, -1};
+    const gsf_nn_tensor *conv, *places, *times, *proj, *tokens, *context;
+    GSF__TRY(gsf__nn_need(loader, &conv, 5, any, "vision_encoder.conv1.weight"));
+    GSF__TRY(gsf__nn_need(loader, &places, 2, any, "vision_encoder.positional_embedding"));
+    GSF__TRY(gsf__nn_need(loader, &times, 3, any, "vision_encoder.temporal_positional_embedding"));
+    GSF__TRY(gsf__nn_need(loader, &proj, 2, any, "vision_encoder.proj"));
+    GSF__TRY(gsf__nn_need(loader, &tokens, 2, any, "text_encoder.token_embedding.weight"));
+    GSF__TRY(gsf__nn_need(loader, &context, 2, any, "text_encoder.positional_embedding"));
+    net->patch = conv->shape[4];
+    net->grid = (int64_t)floor(sqrt((double)places->shape[0] - 0.5));
+    net->samples = times->shape[1];
+    net->features = proj->shape[1];
+    net->vocabulary = tokens->shape[0];
+    net->context = context->shape[0];
+    const int fits = conv->shape[1] == 3 && net->patch > 0 && net->patch < 1024 && net->grid > 0 && net->grid < 1024 &&
+                     net->samples > 0 && net->samples <= GSF__VICLIP_MOST && net->features > 0 && net->features < 1 << 16 &&
+                     net->context > 1 && net->context < 1 << 16 && conv->shape[0] > 0 && tokens->shape[1] > 0;
+    if (!fits)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensors %s and %s do not fit ViCLIP", loader->weights->name,
+                        conv->name, places->name);
+    const gsf__nn_sizes sizes = {{{'d', conv->shape[0]}, {'3', 3}, {'p', net->patch}, {'s', net->grid * net->grid + 1},
+                                  {'f', net->samples}, {'e', net->features}, {'v', net->vocabulary}, {'w', tokens->shape[1]},
+                                  {'c', net->context}}};
+    GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__viclip_entries, "", net));
+    gsf__nn_ignore(loader, "temp");
+    GSF__TRY(gsf__viclip_bind_blocks(loader, conv->shape[0], heads ? heads[0] : 0, "vision_encoder.transformer.resblocks.",
+                                     &net->vision));
+    return gsf__viclip_bind_blocks(loader, tokens->shape[1], heads ? heads[1] : 0, "text_encoder.transformer.resblocks.",
+                                   &net->text);
+}
+
+static void gsf__viclip_close(gsf_context* ctx, void* state) {
+    gsf__viclip* net = (gsf__viclip*)state;
+    gsf__clip_close(ctx, &net->bpe);
+    gsf_free(ctx, net->vision.blocks);
+    gsf_free(ctx, net->text.blocks);
+    gsf_free(ctx, net->pixels);
+    gsf_free(ctx, net->feature);
+    gsf_nn_destroy_weights(ctx, &net->weights);
+}
+
+typedef struct gsf__viclip_run {
+    gsf__nn_run nn;
+    gsf__nn_cache cache;
+    float *memory, *x; // x: (rows, width)
+} gsf__viclip_run;
+
+// Memory for `rows` tokens, in which `wide` floats can be held besides; `causal`: each sees those up to itself.
+static gsf_result gsf__viclip_begin(gsf_context* ctx, const gsf__viclip* net, const gsf__viclip_tower* tower, int64_t rows,
+                                    size_t wide, int causal, const gsf__nn_tap* tap, gsf__viclip_run* run) {
+    const size_t d = (size_t)tower->sizes.width, n = (size_t)rows, x = gsf__nn_product(n, d);
+    gsf__nn_run* nn = &run->nn;
+    memset(run, 0, sizeof *run);
+    nn->ctx = ctx;
+    nn->name = nn->stage = "overall consistency";
+    nn->weights = &net->weights;
+    nn->sizes = &tower->sizes;
+    nn->tap = tap;
+    nn->steps = (double)tower->layers;
+    nn->vectors_size = 2 * d;
+    nn->wide_count = (int64_t)gsf__nn_larger(wide, gsf__nn_wide(&tower->sizes, rows, GSF__VIT_MLP_ROWS));
+    for (int pass = 0; pass < 2; pass++) {
+        gsf__nn_arena arena = {run->memory, 0};
+        run->x = gsf__nn_share(&arena, x);
+        nn->normed = gsf__nn_share(&arena, x);
+        nn->wide = gsf__nn_share(&arena, (size_t)nn->wide_count);
+        nn->vectors = gsf__nn_share(&arena, nn->vectors_size);
+        run->cache.keys = gsf__nn_share(&arena, causal ? x : 0);
+        run->cache.values = gsf__nn_share(&arena, causal ? x : 0);
+        run->cache.mask = (unsigned char*)gsf__nn_share(&arena, causal ? ((size_t)tower->sizes.heads * n * n + 3) / 4 : 0);
+        if (pass) break;
+        run->memory = (float*)gsf_alloc(ctx, arena.used, sizeof(float));
+        if (!run->memory) return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    if (!causal) return GSF_OK;
+    nn->cache = &run->cache;
+    run->cache.capacity = rows;
+    for (int64_t i = 0; i < tower->sizes.heads * rows * rows; i++) run->cache.mask[i] = i % rows <= i / rows % rows;
+    return GSF_OK;
+}
+
+static void gsf__viclip_end(gsf__viclip_run* run) {
+    gsf__nn_destroy_workspace(run->nn.ctx, &run->nn.workspace);
+    gsf_free(run->nn.ctx, run->memory);
+}
+
+// Runs the blocks on run->x, then the norm of row `row` and its projection: out (features)
+static gsf_result gsf__viclip_forward(gsf__viclip_run* run, const gsf__viclip_tower* tower, int64_t rows,
+                                      const gsf__nn_layer* norm, const gsf_nn_tensor* projection, int64_t row, float* out) {
+    const int64_t d = tower->sizes.width;
+    for (int64_t i = 0; i < tower->layers; i++) { // the cache holds one block's keys and values
+        GSF__TRY(gsf__nn_block_forward(&run->nn, &tower->blocks[i], 0, run->x, 1, rows));
+        GSF__TRY(gsf__nn_end_block(&run->nn, tower->names, i, run->x, rows * d));
+        gsf__nn_reveal(&run->nn, run->x, 0, 1, rows, d, "layer%lld", (long long)i);
+    }
+    gsf__nn_norm(&run->nn, norm, tower->sizes.eps, run->x + row * d, 1, run->x);
+    GSF__TRY(gsf__project_row(run->nn.ctx, run->x, projection, out));
+    return gsf__nn_check(&run->nn, "feature", "", out, projection->shape[1]);
+}
+
+// The feature of ids, of which the first `count` matter, the last of these being the one that ends the text.
+static gsf_result gsf__viclip_encode_ids(gsf_context* ctx, const gsf__viclip* net, const int32_t* ids, int64_t count,
+                                         const gsf__nn_tap* tap, float* out) {
+    const int64_t d = net->text.sizes.width;
+    gsf__viclip_run run;
+    gsf_result result = gsf__viclip_begin(ctx, net, &net->text, count, (size_t)d, 1, tap, &run);
+    for (int64_t i = 0; i < count && !result; i++) {
+        float *x = run.x + i * d, *place = run.nn.wide;
+        gsf_nn_convert_tensor(net->tokens, ids[i] * d, d, x);
+        gsf_nn_convert_tensor(net->text_places, i * d, d, place);
+        for (int64_t k = 0; k < d; k++) x[k] += place[k];
+    }
+    snprintf(run.nn.label, sizeof run.nn.label, "text_");
+    if (!result)
+        result = gsf__viclip_forward(&run, &net->text, count, &net->text_norm, net->text_projection, count - 1, out);
+    gsf__viclip_end(&run);
+    return result;
+}
+
+// Ids of a text between those that begin and end it, cut to the context, where the last one ends it. ids: (context), of which
+// the first *count are used: the feature is that of the first id that ends a text.
+static gsf_result gsf__viclip_tokenize(gsf_context* ctx, const gsf__viclip* net, const char* text, int32_t* ids,
+                                       int64_t* count) {
+    int32_t* words;
+    size_t all, i = 0;
+    GSF__TRY(gsf__clip_encode(ctx, &net->bpe, text, &words, &all));
+    ids[i++] = net->bpe.begin;
+    for (; i < (size_t)net->context && i <= all && ids[i - 1] != net->bpe.end; i++) ids[i] = words[i - 1];
+    if (ids[i - 1] != net->bpe.end) {
+        if (i == (size_t)net->context) i--;
+        ids[i++] = net->bpe.end;
+    }
+    *count = (int64_t)i;
+    gsf_free(ctx, words);
+    return GSF_OK;
+}
+
+static gsf_result gsf__viclip_encode_text(gsf_context* ctx, const gsf__viclip* net, const char* text, const gsf__nn_tap* tap,
+                                          float* out) {
+    int64_t count = 0;
+    int32_t* ids = (int32_t*)gsf_alloc(ctx, (size_t)net->context, sizeof *ids);
+    gsf_result result = ids ? gsf__viclip_tokenize(ctx, net, text, ids, &count) : GSF_ERROR_OUT_OF_MEMORY;
+    if (!result) result = gsf__viclip_encode_ids(ctx, net, ids, count, tap, out);
+    gsf_free(ctx, ids);
+    return result;
+}
+
+static gsf_result gsf__viclip_open(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
+    gsf__viclip* net = (gsf__viclip*)state;
+    gsf__nn_loader loader;
+    if (!metric->prompt) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "overall consistency needs a prompt");
+    GSF__TRY(gsf_nn_load_weights(ctx, metric->models, "ViClip-InternVid-10M-FLT", &net->weights));
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
+    GSF__TRY(gsf__nn_end_loading(&loader, gsf__viclip_bind(&loader, metric->_heads, net)));
+    GSF__TRY(gsf__clip_open(ctx, metric->models, &net->bpe));
+    if ((int64_t)net->bpe.end + 1 != net->vocabulary)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld tokens, but %d in the list of merges", net->weights.name,
+                        (long long)net->vocabulary, (int)net->bpe.end + 1);
+    const size_t side = (size_t)(net->grid * net->patch);
+    net->feature = (float*)gsf_alloc(ctx, 2 * (size_t)net->features, sizeof(float));
+    net->pixels = (float*)gsf_alloc(ctx, (size_t)net->samples * 3, gsf__nn_product(side * side, sizeof(float)));
+    if (!net->feature || !net->pixels) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__viclip_encode_text(ctx, net, metric->prompt, metric->_tap, net->feature);
+}
+
+// The frame of a clip that sample `index` takes; the last of a short clip is taken several times.
+static int64_t gsf__viclip_place(int64_t index, int64_t samples, int64_t frames) {
+    const int64_t parts = gsf__least(samples, frames), part = gsf__least(index, parts - 1);
+    return (part * frames / parts + (part + 1) * frames / parts - 1) / 2;
+}
+
+// The centre of a frame (u8, packed) whose shorter side has been resized to `side`: pixels (3, side, side) in [0,1]
+static void gsf__viclip_resize(const gsf_image* frame, int64_t side, float* pixels) {
+    const int64_t w = frame->width, h = frame->height;
+    const int64_t across = w <= h ? side : side * w / h, down = w <= h ? side * h / w : side;
+    const int64_t left = (int64_t)rint((double)(across - side) / 2.0), top = (int64_t)rint((double)(down - side) / 2.0);
+    for (int64_t y = 0; y < side; y++) {
+        double wy[4], wx[4];
+        const int64_t y0 = gsf__cubic_taps(((double)(y + top) + 0.5) * (double)h / (double)down - 0.5, wy);
+        for (int64_t x = 0; x < side; x++) {
+            const int64_t x0 = gsf__cubic_taps(((double)(x + left) + 0.5) * (double)w / (double)across - 0.5, wx);
+            for (int c = 0; c < 3; c++) {
+                double sum = 0.0;
+                for (int v = 0; v < 4; v++) {
+                    const uint8_t* row = (const uint8_t*)frame->data + gsf__at_border(y0 + v, h) * frame->stride_y + c;
+                    double part = 0.0;
+                    for (int u = 0; u < 4; u++) part += (double)row[3 * gsf__at_border(x0 + u, w)] * wx[u];
+                    sum += part * wy[v];
+                }
+                sum = rint(sum);
+                pixels[(c * side + y) * side + x] = (float)(sum > 0.0 ? sum < 255.0 ? sum : 255.0 : 0.0) / 255.0f;
+            }
+        }
+    }
+}
+
+// Tokens of all samples before the blocks: x (1 + patches * samples, width)
+static gsf_result gsf__viclip_embed(gsf__nn_run* nn, const gsf__viclip* net, float* x) {
+    const int64_t d = net->vision.sizes.width, side = net->grid * net->patch, patches = net->grid * net->grid;
+    const int64_t rows = 1 + patches * net->samples;
+    for (int64_t f = 0; f < net->samples; f++) {
+        gsf__nn_patch_job job = {net->pixels + f * 3 * side * side, nn->wide, 3, side, side, net->patch, 0, gsf__clip_mean,
+                                 gsf__clip_deviation};
+        gsf__nn_patch(nn->ctx, &job, 1);
+        GSF__TRY(gsf__nn_linear(nn, &net->patches, GSF__NN_LINEAR, nn->wide, patches, x + (1 + f) * d, net->samples * d));
+    }
+    gsf_nn_convert_tensor(net->class_token, 0, d, x);
+    gsf_nn_convert_tensor(net->times, 0, net->samples * d, nn->wide);
+    for (int64_t i = 0; i < rows; i++) {
+        float *place = nn->wide + net->samples * d, *to = x + i * d;
+        const float* time = nn->wide + (i - 1) % net->samples * d;
+        if (i == 0 || (i - 1) % net->samples == 0)
+            gsf_nn_convert_tensor(net->places, (i + net->samples - 1) / net->samples * d, d, place);
+        for (int64_t k = 0; k < d; k++) to[k] = to[k] + place[k] + (i ? time[k] : 0.0f);
+    }
+    gsf__nn_norm(nn, &net->pre_norm, net->vision.sizes.eps, x, rows, x);
+    gsf__nn_reveal(nn, x, 0, 1, rows, d, "embeddings");
+    return gsf__nn_check(nn, "vision_encoder.", "vision_encoder.", x, rows * d);
+}
+
+// The feature of net->pixels.
+static gsf_result gsf__viclip_encode_frames(gsf_context* ctx, const gsf__viclip* net, const gsf__nn_tap* tap, float* out) {
+    const size_t d = (size_t)net->vision.sizes.width, area = (size_t)(net->grid * net->grid);
+    const int64_t rows = 1 + net->grid * net->grid * net->samples;
+    const size_t wide = gsf__nn_larger(area * (size_t)(3 * net->patch * net->patch), d * (size_t)(net->samples + 1));
+    gsf__viclip_run run;
+    gsf_result result = gsf__viclip_begin(ctx, net, &net->vision, rows, wide, 0, tap, &run);
+    if (!result) result = gsf__viclip_embed(&run.nn, net, run.x);
+    if (!result) result = gsf__viclip_forward(&run, &net->vision, rows, &net->norm, net->projection, 0, out);
+    gsf__viclip_end(&run);
+    return result;
+}
+
+static gsf_result gsf__viclip_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                      const gsf_image* reference) {
+    gsf__viclip* net = (gsf__viclip*)metric->state;
+    const int64_t side = net->grid * net->patch;
+    (void)reference;
+    if (metric->frames < 1 || metric->count >= metric->frames)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "overall consistency: frame %lld of a clip of %lld",
+                        (long long)metric->count + 1, (long long)metric->frames);
+    gsf_image bytes;
+    memset(&bytes, 0, sizeof bytes);
+    for (int64_t i = 0; i < net->samples; i++) {
+        if (gsf__viclip_place(i, net->samples, metric->frames) != metric->count) continue;
+        if (!bytes.data) {
+            gsf_result result = gsf_make_image(ctx, GSF_U8, frame->width, frame->height, 3, &bytes);
+            if (!result) result = gsf_convert_image(ctx, frame, &bytes);
+            if (result) {
+                gsf_destroy_image(ctx, &bytes);
+                return result;
+            }
+        }
+        gsf__viclip_resize(&bytes, side, net->pixels + i * 3 * side * side);
+    }
+    gsf_destroy_image(ctx, &bytes);
+    if (metric->count + 1 == metric->frames) {
+        float *text = net->feature, *clip = text + net->features;
+        GSF__TRY(gsf__viclip_encode_frames(ctx, net, metric->_tap, clip));
+        if (metric->_tap) metric->_tap->fn(metric->_tap->user, "feature", 0, clip, 1, net->features);
+        const double score = gsf__cosine(text, clip, net->features);
+        if (score != score) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "overall consistency: a feature is 0");
+        metric->score = metric->last = score;
+    }
+    metric->count++;
+    return GSF_OK;
+}
+
 // ---- metrics: streams of frames
 
 static gsf_result gsf__lpips_open_metric(gsf_context* ctx, const gsf_nn_metric* metric, void* state) {
@@ -15774,6 +16633,7 @@ static const struct gsf__metric_form { // by kind
     {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
     {sizeof(gsf__i2v), gsf__i2v_open, gsf__i2v_measure, gsf__i2v_close},
     {sizeof(gsf__amt), gsf__amt_open, gsf__amt_measure, gsf__amt_close},
+    {sizeof(gsf__viclip), gsf__viclip_open, gsf__viclip_measure, gsf__viclip_close},
 };
 
 static gsf_result gsf__metric_open(gsf_context* ctx, gsf_nn_metric* metric) {

@@ -1796,59 +1796,6 @@ static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gs
     return job.out ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
 }
 
-/* gzip (RFC 1952) around DEFLATE:
-       1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] |
-       DEFLATE | crc32 4 | size modulo 2^32 4 */
-
-enum { GSF__DEFLATE_RATIO = 1032 }; // upper bound of DEFLATE's compression ratio
-
-static gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
-                                      size_t* body) {
-    size_t at = 10;
-    if (size < 2 || p[0] != 0x1f || p[1] != 0x8b)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not gzip (1f 8b expected)", name);
-    if (size < 18) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut", name, size);
-    if (p[2] != 8 || (p[3] & 0xe0) != 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:2: gzip method %d, flags %d: not supported", name, p[2], p[3]);
-    if (p[3] & 4) at += 2 + (size_t)gsf__load_le(p + 10, 2);
-    for (int text = 8; text <= 16; text *= 2) // optional NUL-terminated name and comment
-        if (p[3] & text) {
-            while (at < size && p[at]) at++;
-            at++;
-        }
-    if (p[3] & 2) at += 2;
-    if (at > size - 8) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut inside the gzip header", name, size);
-    *body = at;
-    return GSF_OK;
-}
-
-// Inflates a gzip file into *out (freed by the caller), *out_size > 0 bytes. The size comes from the file's trailer; it
-// is rejected when DEFLATE could not have compressed that much into a file of this size.
-static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
-                                 unsigned char** out, size_t* out_size) {
-    size_t body = 0;
-    *out = NULL;
-    *out_size = 0;
-    GSF__TRY(gsf__gzip_read_head(ctx, name, data, size, &body));
-    const size_t whole = (size_t)gsf__load_le(data + size - 4, 4);
-    if (whole == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: gzip file without content", name, size - 4);
-    if (whole / GSF__DEFLATE_RATIO > size - body - 8)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes of content claimed, more than %zu can inflate to", name,
-                        size - 4, whole, size - body - 8);
-    unsigned char* content = (unsigned char*)gsf_alloc(ctx, whole, 1);
-    if (!content) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_result result = gsf__inflate(ctx, name, data, size, body, content, whole);
-    if (result == GSF_OK && gsf__load_le(data + size - 8, 4) != gsf__crc32(0, content, whole))
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: checksum mismatch", name, size - 8);
-    if (result != GSF_OK) {
-        gsf_free(ctx, content);
-        return result;
-    }
-    *out = content;
-    *out_size = whole;
-    return GSF_OK;
-}
-
 // Appends `data` (size > 0) as a gzip file; leaves `out` unchanged on error.
 static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out) {
     // Reproducible bytes: no modification time, unknown operating system.

@@ -146,9 +146,11 @@ static const option_spec option_specs[] = {
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
      "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
-     "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage; with --models lpips_alex, lpips_vgg, lpips_squeeze on images in\n"
-     "[-1,1], lpips_alex_raw ... on images in [0,1]; i2v_subject, i2v_background and motion_smoothness measure DIR_A\n"
-     "as a clip, the first two against the first picture of DIR_B (default psnr,ssim_3dgs)"},
+     "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage, ms_ssim, ms_ssim_torchmetrics; with --models lpips_alex, lpips_vgg,\n"
+     "lpips_squeeze on images in [-1,1], lpips_alex_raw ... on images in [0,1]. DIR_A as a clip: temporal_flickering; with\n"
+     "--models motion_smoothness, overall_consistency (with --prompt), and against the first picture of DIR_B i2v_subject,\n"
+     "i2v_background (default psnr,ssim_3dgs)"},
+    {"--prompt", TEXT, AT(prompt), 0, 0, "TEXT", "metrics", "what DIR_A shows, for overall_consistency"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
@@ -948,12 +950,14 @@ typedef struct metric_spec {
     int raw, clip; // for LPIPS; measures DIR_A as a clip
 } metric_spec;
 
-enum { PSNR = -4, SSIM_3DGS, SSIM_TORCHMETRICS, SSIM_SKIMAGE }; // values of `net`
+enum { FLICKERING = -7, MS_SSIM, MS_SSIM_TORCHMETRICS, PSNR, SSIM_3DGS, SSIM_TORCHMETRICS, SSIM_SKIMAGE }; // values of `net`
 static const metric_spec metric_specs[] = {
     {"psnr", PSNR, 0, 0},
     {"ssim_3dgs", SSIM_3DGS, 0, 0},
     {"ssim_torchmetrics", SSIM_TORCHMETRICS, 0, 0},
     {"ssim_skimage", SSIM_SKIMAGE, 0, 0},
+    {"ms_ssim", MS_SSIM, 0, 0},
+    {"ms_ssim_torchmetrics", MS_SSIM_TORCHMETRICS, 0, 0},
     {"lpips_alex", GSF_NN_METRIC_LPIPS_ALEX, 0, 0},
     {"lpips_vgg", GSF_NN_METRIC_LPIPS_VGG, 0, 0},
     {"lpips_squeeze", GSF_NN_METRIC_LPIPS_SQUEEZE, 0, 0},
@@ -963,6 +967,8 @@ static const metric_spec metric_specs[] = {
     {"i2v_subject", GSF_NN_METRIC_I2V_SUBJECT, 0, 1},
     {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND, 0, 1},
     {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS, 0, 1},
+    {"overall_consistency", GSF_NN_METRIC_OVERALL_CONSISTENCY, 0, 1},
+    {"temporal_flickering", FLICKERING, 0, 1},
 };
 enum { METRIC_COUNT = sizeof metric_specs / sizeof *metric_specs };
 
@@ -971,9 +977,9 @@ typedef struct metric_run {
     gsf_nn_metric nets[METRIC_COUNT]; // of the metrics that need a network
 } metric_run;
 
-// Of a pair of images. Masks apply to the metrics of pixels only.
+// Of a pair of images. Masks apply to the metrics of pixels that have one scale.
 static int measures_pair(const metric_run* run, int m, int seen) {
-    return run->wanted[m] && !metric_specs[m].clip && (!seen || metric_specs[m].net < 0);
+    return run->wanted[m] && !metric_specs[m].clip && (!seen || (metric_specs[m].net < 0 && metric_specs[m].net >= PSNR));
 }
 
 static gsf_result measure(gsf_context* ctx, metric_run* run, int m, const gsf_image* a, const gsf_image* b,
@@ -984,6 +990,8 @@ static gsf_result measure(gsf_context* ctx, metric_run* run, int m, const gsf_im
         case SSIM_3DGS: return gsf_measure_ssim(ctx, GSF_SSIM_3DGS, a, b, mask, out);
         case SSIM_TORCHMETRICS: return gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, a, b, mask, out);
         case SSIM_SKIMAGE: return gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, a, b, mask, out);
+        case MS_SSIM: return gsf_measure_ssim(ctx, GSF_SSIM_MULTISCALE, a, b, mask, out);
+        case MS_SSIM_TORCHMETRICS: return gsf_measure_ssim(ctx, GSF_SSIM_MULTISCALE_TORCHMETRICS, a, b, mask, out);
         default:
             result = gsf_nn_measure_frame(ctx, &run->nets[m], a, b);
             *out = run->nets[m].last;
@@ -999,6 +1007,7 @@ static gsf_result open_networks(gsfix_app* app, metric_run* run) {
         run->nets[m].kind = (gsf_nn_metric_kind)metric_specs[m].net;
         run->nets[m].raw = metric_specs[m].raw;
         run->nets[m].models = app->o.models;
+        run->nets[m].prompt = app->o.prompt;
         result = gsf_nn_measure_frame(&app->ctx, &run->nets[m], NULL, NULL);
     }
     return result;
@@ -1027,7 +1036,7 @@ static gsf_result compare_pair(gsfix_app* app, metric_run* run, const char* stem
                                metric_sums* total) {
     gsf_context* ctx = &app->ctx;
     gsf_image x = {0}, y = {0}, mask = {0};
-    char line[256] = "";
+    char line[384] = "";
     gsf_result result = gsf_load_image(ctx, left, 3, &x);
     if (result == GSF_OK) result = gsf_load_image(ctx, right, 3, &y);
     if (result == GSF_OK && (x.width != y.width || x.height != y.height))
@@ -1076,16 +1085,34 @@ static void print_means(gsfix_app* app, const metric_run* run, const metric_sums
     }
 }
 
-// Passes the pictures of DIR_A, in the order of their names, to the networks that measure clips, with DIR_B's first picture
-// as the input image.
+// Measures the frame after `before`, which has no data for the first one.
+static gsf_result measure_frame(gsf_context* ctx, metric_run* run, int m, const gsf_image* before, const gsf_image* frame,
+                                const gsf_image* input) {
+    gsf_nn_metric* net = &run->nets[m];
+    double change = 0.0;
+    if (metric_specs[m].net != FLICKERING) return gsf_nn_measure_frame(ctx, net, frame, input);
+    const gsf_result result = before->data ? gsf_measure_difference(ctx, before, frame, NULL, &change) : GSF_OK;
+    net->last += change; // the sum, as there is no network
+    net->score = net->count ? 1.0 - net->last / (double)net->count : 1.0;
+    net->count++;
+    return result;
+}
+
+static size_t least_frames(int net) {
+    return net == GSF_NN_METRIC_MOTION_SMOOTHNESS ? 3 : net == GSF_NN_METRIC_OVERALL_CONSISTENCY ? 1 : 2;
+}
+
+// Passes the pictures of DIR_A, in the order of their names, to what measures clips, with DIR_B's first picture as the input
+// image. Two frames are held at a time.
 static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_names* left, const gsfix_names* right) {
     gsf_context* ctx = &app->ctx;
     int clips = 0;
     gsf_result result = GSF_OK;
-    gsf_image input = {0}, frame = {0};
+    gsf_image input = {0}, frame = {0}, before = {0};
     for (int m = 0; m < METRIC_COUNT; m++) {
         if (!run->wanted[m] || !metric_specs[m].clip) continue;
-        const size_t least = metric_specs[m].net == GSF_NN_METRIC_MOTION_SMOOTHNESS ? 3 : 2;
+        const size_t least = least_frames(metric_specs[m].net);
+        run->nets[m].frames = (int64_t)left->count;
         if (left->count < least)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has %zu pictures; %s needs at least %zu", app->o.inputs[0],
                             left->count, metric_specs[m].name, least);
@@ -1097,10 +1124,13 @@ static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_name
     for (size_t i = 0; i < left->count && result == GSF_OK; i++) {
         result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[0], left->names[i]).s, 3, &frame);
         for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++)
-            if (run->wanted[m] && metric_specs[m].clip) result = gsf_nn_measure_frame(ctx, &run->nets[m], &frame, &input);
-        gsf_destroy_image(ctx, &frame);
+            if (run->wanted[m] && metric_specs[m].clip) result = measure_frame(ctx, run, m, &before, &frame, &input);
+        gsf_destroy_image(ctx, &before);
+        before = frame;
+        memset(&frame, 0, sizeof frame);
         gsfix_progress(app, (double)(i + 1), (double)left->count, "frame %zu of %zu", i + 1, left->count);
     }
+    gsf_destroy_image(ctx, &before);
     gsf_destroy_image(ctx, &input);
     if (result != GSF_OK) return result;
     gsfix_print(app, "clip of %zu frames:", left->count);
@@ -1150,7 +1180,7 @@ static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
 
 static int run_metrics(gsfix_app* app) {
     metric_run run = {0};
-    int nets = 0;
+    int nets = 0, prompts = 0;
     const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
@@ -1159,12 +1189,16 @@ static int run_metrics(gsfix_app* app) {
         if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
         if (metric_specs[m].net >= 0 && !app->o.models)
             return gsfix_misused(app, "%s needs --models", metric_specs[m].name);
+        const int reads = metric_specs[m].net == GSF_NN_METRIC_OVERALL_CONSISTENCY;
+        if (reads && !app->o.prompt) return gsfix_misused(app, "%s needs --prompt", metric_specs[m].name);
+        prompts += reads;
         run.wanted[m] = 1;
         nets += metric_specs[m].net >= 0;
         p += n;
         if (!*p) break;
     }
     if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
+    if (app->o.prompt && !prompts) return gsfix_misused(app, "--prompt: no metric of --which needs it");
     return compare_folders(app, &run) == GSF_OK ? 0 : gsfix_failed(app);
 }
 

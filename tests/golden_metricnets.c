@@ -10,11 +10,13 @@
 #include "metricnets_amt.h"
 #include "metricnets_i2v.h"
 #include "metricnets_pth.h"
+#include "metricnets_viclip.h"
 
 int main(void) {
     check_pth();
     check_dino();
     check_dreamsim();
     check_amt();
+    check_viclip();
     return test_report();
 }

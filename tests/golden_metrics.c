@@ -1,5 +1,6 @@
-// PSNR, SSIM and LPIPS against golden/metrics (float64 runs of the reference implementations), PSNR and SSIM also against
-// direct loops in double precision. GSF_TEST_VERBOSE=1 prints every value of LPIPS.
+// PSNR, SSIM, temporal flickering and LPIPS against golden/metrics (float64 runs of the reference implementations), PSNR and
+// SSIM also against direct loops in double precision, MS-SSIM against values of two packages. GSF_TEST_VERBOSE=1 prints every
+// value of LPIPS.
 #include "gsfixer.h"
 #include "test.h"
 #include "test_hooks.h"
@@ -161,6 +162,10 @@ static void check_pair(gsf_context* ctx, const gsf_json* json, const gsf_json_va
     if (isinf(psnr)) CHECK(got > 140.0); // u8 against its own float32 rounding
     else test_compare(name, &got, &psnr, 1, 2e-6);
 
+    const double l1 = number_or_inf(json, e, "l1");
+    CHECK_OK(ctx, gsf_measure_difference(ctx, &p->a, &p->b, NULL, &got));
+    test_compare(name, &got, &l1, 1, 1e-7);
+
     const double plain = plain_ssim_3dgs(&p->fa, &p->fb, NULL);
     test_compare(name, &plain, &tg, 1, 1e-9);
     CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->fa, &p->fb, NULL, &got));
@@ -222,7 +227,7 @@ static void check_masks(gsf_context* ctx, const pair* p) {
 
 // Bit-identical for any worker count and instruction set, on a noise image large enough for several chunks.
 static void check_determinism(gsf_context* ctx) {
-    enum { W = 211, H = 173 };
+    enum { W = 211, H = 177 };
     static float a[W * H * 3], b[W * H * 3];
     uint64_t seed = 3;
     for (size_t i = 0; i < W * H * 3; i++) {
@@ -239,7 +244,7 @@ static void check_determinism(gsf_context* ctx) {
     scalar.cpu_level = GSF_CPU_SCALAR;
     CHECK_OK(&scalar, gsf_init_context(&scalar));
     double one = 0, three = 1, plain = 2;
-    for (int kind = 0; kind < 3; kind++) {
+    for (int kind = 0; kind <= GSF_SSIM_MULTISCALE_TORCHMETRICS; kind++) {
         CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &x, &y, NULL, &one));
         CHECK_OK(&other, gsf_measure_ssim(&other, (gsf_ssim_kind)kind, &x, &y, NULL, &three));
         CHECK_OK(&scalar, gsf_measure_ssim(&scalar, (gsf_ssim_kind)kind, &x, &y, NULL, &plain));
@@ -267,6 +272,78 @@ static void check_determinism(gsf_context* ctx) {
     CHECK(one == 1.0);
 }
 
+// MS-SSIM of two images given by a formula, against pytorch-msssim 1.0.0 and torchmetrics 1.9.0 in float64:
+//     y, x, c = np.meshgrid(np.arange(h), np.arange(w), np.arange(3), indexing="ij")
+//     a = 128 + 60 * (x // (5 + c) % 2) - 30 + 40 * (y // 9 % 2) - 20 + x * y % 31 - 15
+//     b = np.clip(a + (x * 31 + y * 17 + c * 7) % 81 - 40, 0, 255)
+//     a, b = (torch.from_numpy((v / 255).transpose(2, 0, 1)[None]) for v in (a, b))
+//     ms_ssim(a, b, data_range=1.0)
+//     multiscale_structural_similarity_index_measure(a, b, data_range=1.0, normalize="relu")
+static void check_multiscale(gsf_context* ctx) {
+    static const struct { int height, width; double expected[2]; } sizes[] = {
+        {176, 176, {0.9741351139, 0.9741640015}}, {203, 181, {0.9732706694, 0.9742423293}}};
+    for (int i = 0; i < 2; i++) {
+        const int h = sizes[i].height, w = sizes[i].width;
+        uint8_t* bytes = (uint8_t*)malloc((size_t)(2 * 3 * h * w));
+        gsf_image a = gsf_wrap_image(bytes, GSF_U8, w, h, 3), b = gsf_wrap_image(bytes + 3 * h * w, GSF_U8, w, h, 3);
+        for (int at = 0; at < 3 * h * w; at++) {
+            const int c = at % 3, x = at / 3 % w, y = at / 3 / w;
+            const int v = 128 + 60 * (x / (5 + c) % 2) - 30 + 40 * (y / 9 % 2) - 20 + x * y % 31 - 15;
+            const int changed = v + (x * 31 + y * 17 + c * 7) % 81 - 40;
+            bytes[at] = (uint8_t)v;
+            bytes[3 * h * w + at] = (uint8_t)(changed < 0 ? 0 : changed > 255 ? 255 : changed);
+        }
+        for (int kind = 0; kind < 2; kind++) {
+            const gsf_ssim_kind k = kind ? GSF_SSIM_MULTISCALE_TORCHMETRICS : GSF_SSIM_MULTISCALE;
+            double got = 0.0;
+            CHECK_OK(ctx, gsf_measure_ssim(ctx, k, &a, &b, NULL, &got));
+            CHECK_NEAR(got, sizes[i].expected[kind], 1e-7);
+            CHECK_OK(ctx, gsf_measure_ssim(ctx, k, &a, &a, NULL, &got));
+            CHECK_NEAR(got, 1.0, 1e-12);
+            gsf_image small = a, mask = gsf_wrap_image(bytes, GSF_U8, w, h, 1);
+            small.height = kind ? 175 : 160;
+            CHECK_RESULT(ctx, gsf_measure_ssim(ctx, k, &small, &small, NULL, &got), GSF_ERROR_DEGENERATE);
+            CHECK_RESULT(ctx, gsf_measure_ssim(ctx, k, &a, &b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
+        }
+        free(bytes);
+    }
+}
+
+// Temporal flickering of every clip tf.*, from differences of successive frames.
+static void check_flickering(gsf_context* ctx) {
+    test_tensors file = test_open_tensors(test_golden("metrics/vbench.safetensors"));
+    size_t size;
+    char* text = test_read_file(test_golden("metrics/vbench_expected.json"), &size);
+    gsf_json json;
+    int clips = 0;
+    if (!CHECK_OK(ctx, gsf_parse_json(ctx, "vbench_expected.json", text, size, &json))) return;
+    for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
+        if (strncmp(json.values[i].key, "tf.", 3) != 0) continue;
+        char name[96];
+        snprintf(name, sizeof name, "%s.frames", json.values[i].key);
+        test_tensor t = test_find_tensor(&file, name);
+        double sum = 0.0, now = 0.0;
+        if (!CHECK(t.v && t.rank == 4)) continue;
+        const size_t frame = t.dim[1] * t.dim[2] * t.dim[3];
+        uint8_t* bytes = bytes_of(&t);
+        for (size_t k = 0; k + 1 < t.dim[0]; k++) {
+            const gsf_image a = gsf_wrap_image(bytes + k * frame, GSF_U8, (int64_t)t.dim[2], (int64_t)t.dim[1],
+                                               (int32_t)t.dim[3]);
+            const gsf_image b = gsf_wrap_image(bytes + (k + 1) * frame, GSF_U8, a.width, a.height, a.channels);
+            CHECK_OK(ctx, gsf_measure_difference(ctx, &a, &b, NULL, &now));
+            sum += now;
+        }
+        CHECK_NEAR(1.0 - sum / (double)(t.dim[0] - 1), json.values[i].number, 1e-6); // the reference averages in float32
+        free(bytes);
+        test_free_tensor(&t);
+        clips++;
+    }
+    CHECK(clips > 0);
+    gsf_destroy_json(ctx, &json);
+    test_close_tensors(&file);
+    free(text);
+}
+
 int main(void) {
     gsf_context ctx;
     test_context_zero(&ctx);
@@ -290,6 +367,8 @@ int main(void) {
         close_pair(&ctx, &p);
     }
     check_determinism(&ctx);
+    check_multiscale(&ctx);
+    check_flickering(&ctx);
     lpips_close(&ctx, nets);
     gsf_destroy_json(&ctx, &json);
     test_close_tensors(&file);

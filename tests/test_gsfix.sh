@@ -54,6 +54,9 @@ expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" metrics a b --models m
 expect 2 "$gsfix" metrics a b --which lpips_vgg
 expect 1 "$gsfix" metrics a b --which lpips_vgg --models nothing_here
+expect 2 "$gsfix" metrics a b --which overall_consistency --models m
+expect 2 "$gsfix" metrics a b --prompt "a room"
+expect 1 "$gsfix" metrics a b --which overall_consistency --models nothing_here --prompt "a room"
 expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
 expect 2 "$gsfix" info "$scene" --out x
 expect 2 "$gsfix" fix "$scene" --out x --also ply
@@ -220,6 +223,10 @@ holds '"ssim_skimage":' stdout
 holds '"ssim_3dgs":1[,}]' stdout # the render of the saved splats is the image that fix wrote
 expect 0 "$gsfix" path "$scene" --views 3 --frames 8 --out path.json
 expect 0 "$gsfix" render a/splats.ply --path path.json --out flight --depth
+expect 0 "$gsfix" metrics flight flight --which temporal_flickering --json
+holds '"temporal_flickering":0\.[5-9]' stdout # a slow flight
+expect 1 "$gsfix" metrics flight flight --which ms_ssim # too small for five scales
+holds "smaller than the window" stderr
 [ "$(ls flight/*.png | wc -l)" = 8 ] && [ "$(ls flight/depth/*.npy | wc -l)" = 8 ] || fail "not 8 frames and depths"
 expect 0 "$gsfix" filter "$scene" --views 3 --out filtered
 ln -s "$scene/images" filtered/images

@@ -90,6 +90,8 @@ static void run_images(gsf_context* ctx, run_output* run) {
         CHECK_OK(ctx, gsf_measure_ssim(ctx, kinds[i], &image_a, &image_b, NULL, &value));
         add(out, &value, sizeof value);
     }
+    CHECK_OK(ctx, gsf_measure_difference(ctx, &image_a, &image_b, NULL, &value));
+    add(out, &value, sizeof value);
     free(a);
     free(b);
     free(bytes);
