@@ -1520,7 +1520,7 @@ static int run_command(gsfix_app* app, const command_spec* command, int argc, ch
     return code;
 }
 
-int main(int argc, char** argv) {
+int gsfix_start(int argc, char** argv, const struct gsfix_crew* crew) {
     static gsfix_app app;
     memset(&app, 0, sizeof app); // tests call this more than once
     if (argc < 2) return print_overview(stderr);
@@ -1536,6 +1536,7 @@ int main(int argc, char** argv) {
     app.started = gsfix_now();
     app.terminal = isatty(2) && getenv("TERM") && strcmp(getenv("TERM"), "dumb") != 0;
     app.line_share = -1;
+    app.crew = crew;
     app.o.inputs = (const char**)calloc((size_t)argc, sizeof(char*));
     if (!app.o.inputs) return fputs("gsfix: out of memory\n", stderr), 1;
     int code = parse_options(&app, command, argc, argv);
@@ -1544,6 +1545,8 @@ int main(int argc, char** argv) {
     free((void*)app.o.inputs);
     return code;
 }
+
+int main(int argc, char** argv) { return gsfix_start(argc, argv, NULL); }
 
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
 #include "gsfix_dataset.c"
