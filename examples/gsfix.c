@@ -1148,10 +1148,9 @@ static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
     return result;
 }
 
-static int run_metrics(gsfix_app* app) {
-    metric_run run = {0};
-    int nets = 0;
-    const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
+// Parses --which; 0 or an exit code. *nets: how many of the metrics need a network.
+static int choose_metrics(gsfix_app* app, const char* which, metric_run* run, int* nets) {
+    *nets = 0;
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
@@ -1159,13 +1158,70 @@ static int run_metrics(gsfix_app* app) {
         if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
         if (metric_specs[m].net >= 0 && !app->o.models)
             return gsfix_misused(app, "%s needs --models", metric_specs[m].name);
-        run.wanted[m] = 1;
-        nets += metric_specs[m].net >= 0;
+        run->wanted[m] = 1;
+        *nets += metric_specs[m].net >= 0;
         p += n;
-        if (!*p) break;
+        if (!*p) return 0;
     }
+}
+
+static int run_metrics(gsfix_app* app) {
+    metric_run run = {0};
+    int nets = 0;
+    const int code = choose_metrics(app, app->o.which ? app->o.which : "psnr,ssim_3dgs", &run, &nets);
+    if (code) return code;
     if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
     return compare_folders(app, &run) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+struct gsfix_meter {
+    metric_run run;
+    double sums[METRIC_COUNT];
+    size_t pairs;
+};
+
+int gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out) {
+    int nets = 0, code;
+    *out = (gsfix_meter*)gsf_alloc_zeroed(&app->ctx, 1, sizeof **out);
+    if (!*out) return gsfix_failed(app);
+    code = choose_metrics(app, which, &(*out)->run, &nets);
+    if (!code && open_networks(app, &(*out)->run) != GSF_OK) code = gsfix_failed(app);
+    return code;
+}
+
+gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
+                             const gsf_image* input) {
+    gsf_result result = GSF_OK;
+    for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
+        double value = 0.0;
+        if (!meter->run.wanted[m]) continue;
+        if (metric_specs[m].clip && input) result = gsf_nn_measure_frame(&app->ctx, &meter->run.nets[m], frame, input);
+        if (metric_specs[m].clip || !truth) continue;
+        result = measure(&app->ctx, &meter->run, m, frame, truth, NULL, &value);
+        meter->sums[m] += value;
+    }
+    if (result == GSF_OK && truth) meter->pairs++;
+    return result;
+}
+
+double gsfix_read_meter(const gsfix_meter* meter, const char* name) {
+    for (int m = 0; m < METRIC_COUNT; m++) {
+        if (strcmp(metric_specs[m].name, name) != 0 || !meter->run.wanted[m]) continue;
+        if (metric_specs[m].clip) return meter->run.nets[m].count ? meter->run.nets[m].score : NAN;
+        return meter->sums[m] / (double)meter->pairs; // of none: NaN
+    }
+    return NAN;
+}
+
+int gsfix_has_metric(const char* name) {
+    for (int m = 0; m < METRIC_COUNT; m++)
+        if (strcmp(metric_specs[m].name, name) == 0) return 1;
+    return 0;
+}
+
+void gsfix_destroy_meter(gsfix_app* app, gsfix_meter* meter) {
+    for (int m = 0; meter && m < METRIC_COUNT; m++) gsf_nn_destroy_metric(&app->ctx, &meter->run.nets[m]);
+    gsf_free(&app->ctx, meter);
 }
 
 // ---- masks -----------------------------------------------------------------------
@@ -1236,17 +1292,7 @@ static int run_masks(gsfix_app* app) {
        frames/NAME.png  depth/NAME.npy  cameras.json
        refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy  refs/render/NAME.png
    exec needs only the frames; warp needs all of it (without refs/render it reprojects the photos themselves). */
-typedef struct clip {
-    gsfix_names frame_names, ref_names;
-    size_t frames, refs;
-    gsf_image *color, *depth, *alpha, *out_color, *out_confidence;
-    gsf_camera *cameras, *ref_cameras;
-    size_t camera_count, ref_camera_count;
-    int32_t* reference_index;
-    gsf_reference* references;
-} clip;
-
-static gsf_result load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
+gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
     gsf_image bytes;
     memset(out, 0, sizeof *out);
     gsf_result result = gsf_load_image(ctx, path, channels, &bytes);
@@ -1257,7 +1303,20 @@ static gsf_result load_float(gsf_context* ctx, const char* path, int32_t channel
     return result;
 }
 
-static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
+gsf_result gsfix_make_clip(gsf_context* ctx, size_t frames, gsfix_clip* c) {
+    c->color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * frames, sizeof *c->color);
+    c->reference_index = (int32_t*)gsf_alloc(ctx, frames, sizeof *c->reference_index);
+    if (!c->color || !c->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
+    c->frames = frames;
+    c->depth = c->color + frames;
+    c->alpha = c->depth + frames;
+    c->out_color = c->alpha + frames;
+    c->out_confidence = c->out_color + frames;
+    for (size_t i = 0; i < frames; i++) c->reference_index[i] = -1;
+    return GSF_OK;
+}
+
+static gsf_result load_clip_frames(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     const char* folder = app->o.inputs[0];
     const gsfix_path inner = gsfix_pathf("%s/frames", folder);
@@ -1268,22 +1327,14 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     if (result != GSF_OK) return result;
     const size_t n = c->frame_names.count;
     if (n == 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no pictures there", at);
-    c->color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * n, sizeof *c->color);
-    c->reference_index = (int32_t*)gsf_alloc(ctx, n, sizeof *c->reference_index);
-    if (!c->color || !c->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
-    c->frames = n;
-    c->depth = c->color + n;
-    c->alpha = c->depth + n;
-    c->out_color = c->alpha + n;
-    c->out_confidence = c->out_color + n;
+    if ((result = gsfix_make_clip(ctx, n, c)) != GSF_OK) return result;
     for (size_t i = 0; i < n && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_stem(c->frame_names.names[i]);
-        c->reference_index[i] = -1;
         for (size_t k = 0; k < i; k++) // a.jpg and a.png would share one output name
             if (strcmp(gsfix_stem(c->frame_names.names[k]).s, stem.s) == 0)
                 return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %s and %s differ in nothing but their ending", at,
                                 c->frame_names.names[k], c->frame_names.names[i]);
-        result = load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
+        result = gsfix_load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
         const int64_t width = c->color[i].width, height = c->color[i].height;
         if (result == GSF_OK && (width != c->color[0].width || height != c->color[0].height))
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/%s: %lld x %lld, but the first frame is %lld x %lld", at,
@@ -1294,7 +1345,7 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
         if (result == GSF_OK && depth && (c->depth[i].width != width || c->depth[i].height != height))
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/depth/%s.npy: not of the frame's size", folder, stem.s);
         if (result == GSF_OK && alpha)
-            result = load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
+            result = gsfix_load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 3, c->out_color + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 1, c->out_confidence + i);
     }
@@ -1310,7 +1361,7 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     return result;
 }
 
-static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
+static gsf_result load_clip_refs(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     const gsfix_path folder = gsfix_pathf("%s/refs", app->o.inputs[0]);
     gsf_result result = GSF_OK;
@@ -1335,17 +1386,17 @@ static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
         gsf_reference* r = c->references + i;
         const char* name = c->ref_names.names[i];
         c->refs = i + 1;
-        result = load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
+        result = gsfix_load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
         if (result == GSF_OK && c->ref_camera_count == c->ref_names.count) r->camera = c->ref_cameras[i];
         const gsfix_path render = gsfix_pathf("%s/render/%s.png", folder.s, gsfix_stem(name).s);
         const gsfix_path depth = gsfix_pathf("%s/depth/%s.npy", folder.s, gsfix_stem(name).s);
-        if (result == GSF_OK && gsfix_exists(render.s)) result = load_float(ctx, render.s, 3, &r->render);
+        if (result == GSF_OK && gsfix_exists(render.s)) result = gsfix_load_float(ctx, render.s, 3, &r->render);
         if (result == GSF_OK && gsfix_exists(depth.s)) result = gsfix_load_npy(ctx, depth.s, &r->depth);
     }
     return result;
 }
 
-static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // requirements of the warp restorer
+static gsf_result check_warp_clip(gsfix_app* app, const gsfix_clip* c) { // requirements of the warp restorer
     const char* folder = app->o.inputs[0];
     const char* lacks = !c->cameras                       ? "cameras.json (where the frames are)"
                         : !c->depth                       ? "depth/NAME.npy of each frame"
@@ -1358,7 +1409,7 @@ static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // requiremen
     return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s: the restorer warp needs %s", folder, lacks);
 }
 
-static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) {
+gsf_result gsfix_restore_clip(gsfix_app* app, gsfix_clip* c, gsf_restorer* restorer) {
     gsf_context* ctx = &app->ctx;
     gsf_restore_window window = {0};
     window.struct_size = sizeof window;
@@ -1378,7 +1429,7 @@ static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) 
     return result;
 }
 
-static void free_clip(gsfix_app* app, clip* c) {
+void gsfix_free_clip(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     for (size_t i = 0; i < 5 * c->frames; i++) gsf_destroy_image(ctx, c->color + i);
     for (size_t i = 0; i < c->refs; i++) {
@@ -1395,7 +1446,7 @@ static void free_clip(gsfix_app* app, clip* c) {
     gsfix_free_names(ctx, &c->ref_names);
 }
 
-static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
+static gsf_result open_restore_out(gsfix_app* app, const gsfix_clip* c) {
     gsf_result result = gsfix_claim(app, "dit.checkpoint");
     if (result == GSF_OK) result = gsfix_claim(app, "dit.checkpoint.*");
     for (size_t i = 0; i < c->frames && result == GSF_OK; i++) {
@@ -1410,7 +1461,7 @@ static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
 
 static gsf_result restore_folder(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
-    clip c = {0};
+    gsfix_clip c = {0};
     gsf_restorer restorer = {0};
     int present = 0;
     const double begin = gsfix_now();
@@ -1419,7 +1470,7 @@ static gsf_result restore_folder(gsfix_app* app) {
     if (result == GSF_OK && strcmp(app->o.restorer, "warp") == 0) result = check_warp_clip(app, &c);
     if (result == GSF_OK) result = open_restore_out(app, &c);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &restorer, &present);
-    if (result == GSF_OK && present) result = restore_clip(app, &c, &restorer);
+    if (result == GSF_OK && present) result = gsfix_restore_clip(app, &c, &restorer);
     for (size_t i = 0; i < c.frames && result == GSF_OK; i++) {
         const gsfix_path name = gsfix_stem(c.frame_names.names[i]);
         result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name.s).s,
@@ -1439,7 +1490,7 @@ static gsf_result restore_folder(gsfix_app* app) {
         gsfix_print_stages(app);
     }
     gsfix_destroy_restorer(app, &restorer);
-    free_clip(app, &c);
+    gsfix_free_clip(app, &c);
     return result;
 }
 

@@ -173,6 +173,29 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app); // from the options, for -
 gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app); // removes the last clip's checkpoint when the run is complete
 gsf_traj_kind gsfix_path_kind(const char* name);
 
+typedef struct gsfix_clip { // frames, photos and what a restorer makes of them
+    gsfix_names frame_names, ref_names;
+    size_t frames, refs;
+    gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // per frame; depth, alpha: or NULL
+    gsf_camera *cameras, *ref_cameras;
+    size_t camera_count, ref_camera_count;
+    int32_t* reference_index;
+    gsf_reference* references;
+} gsfix_clip;
+gsf_result gsfix_make_clip(gsf_context* ctx, size_t frames, gsfix_clip* c); // fills in the lists of frames of a zeroed clip
+gsf_result gsfix_restore_clip(gsfix_app* app, gsfix_clip* c, gsf_restorer* restorer);
+void gsfix_free_clip(gsfix_app* app, gsfix_clip* c);
+gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out); // as f32
+
+typedef struct gsfix_meter gsfix_meter; // mean values of metrics over pairs of images, and values of a clip
+int gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out); // opens the networks; 0 or an exit code
+// truth NULL: the frame does not count for metrics of pairs; input: of the metrics of clips, NULL: the frame is not in a clip.
+gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
+                             const gsf_image* input);
+double gsfix_read_meter(const gsfix_meter* meter, const char* name); // NaN: not measured
+int gsfix_has_metric(const char* name);                              // is the metric in this version?
+void gsfix_destroy_meter(gsfix_app* app, gsfix_meter* meter);
+
 // ---- gsfix_tasks.c: commands whose work is a list of tasks ------------------------
 /* A task has a folder of its own, OUT/NAME, with its own manifest and lock, and writes nothing else. What it writes depends
    on the command line and the inputs only, so that any process may do it, and another one may finish what a killed one
