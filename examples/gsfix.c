@@ -26,25 +26,45 @@ typedef struct option_spec {
 } option_spec;
 
 #define AT(field) offsetof(gsfix_options, field)
-#define ALL "info fix render filter path restore metrics masks dataset"
+#define ALL "info fix render filter path restore metrics masks dataset evaluate"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset",
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset evaluate",
      "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
     {"--views", TEXT, AT(views), 0, 0, "3,6,9", "dataset",
      "numbers of reference views, each with splats and sequences of its own (default 3)"},
-    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
+    {"--views", TEXT, AT(views), 0, 0, "3,6,9", "evaluate",
+     "numbers of training views (default 3,6,9); restorers and trajectories are compared with the first of them"},
+    {"--restorers", TEXT, AT(restorers), 0, 0, "LIST", "evaluate",
+     "what is compared, separated by commas (default plain,none,warp): plain, 3DGS without regularisers; none, with\n"
+     "regularisers for few views; warp, dit:MODEL_DIR and exec:COMMAND, these and a restorer as for gsfix fix"},
+    {"--trajectories", TEXT, AT(trajectories), 0, 0, "LIST", "evaluate",
+     "camera paths of the frames to repair, of reference, ellipse, interpolate (default reference); several give the\n"
+     "table that compares them"},
+    {"--inits", TEXT, AT(inits), 0, 0, "LIST", "evaluate",
+     "initial points, of tracks, default, embree, both, all, dense, random (default tracks, as in the paper; default is\n"
+     "what gsfix fix does without --init)"},
+    {"--conditions", TEXT, AT(conditions), 0, 0, "LIST", "evaluate",
+     "dit: features of the photos that guide it, of none, 2d, 3d, both (default both); several give the table that\n"
+     "compares them"},
+    {"--seeds", INT, AT(seeds), 1, 1000, "N", "evaluate",
+     "run everything N times, from --seed on; tables have the mean and its standard error (default 1)"},
+    {"--tables", TEXT, AT(tables), 0, 0, "LIST", "evaluate",
+     "which tables to make, of restoration, reconstruction, conditions, trajectories (default: all that the lists allow)"},
+    {"--benchmark", TEXT, AT(benchmark), 0, 0, "dl3dv|mipnerf360", "evaluate",
+     "the scenes are those of this data set, by the names of their folders: the paper's printed figures stand beside ours"},
+    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info evaluate",
      "hold out every Nth view by name (default 8)"},
-    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset",
+    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
-    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset",
+    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset evaluate",
      "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
      "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
      "diffusion model; exec is a program of yours, run as COMMAND JOBDIR"},
-    {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
+    {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore evaluate",
      "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
      "dit: features of the photos that guide the model: 2d (semantic), 3d (geometric), both (default) or none"},
@@ -54,27 +74,27 @@ static const option_spec option_specs[] = {
      "tensors are computed by the model's encoders"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
      "dit: save the encoded photos and the prompts of all clips to a new file, for --ref-features"},
-    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
+    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore evaluate",
      "dit: the prompt, a description of the scene (default: the model captions the first frame of each clip)"},
-    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: denoising steps (default 50; with --quality fast 10)"},
-    {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
+    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore evaluate", "dit: denoising steps (default 50; with --quality fast 10)"},
+    {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore evaluate",
      "dit: solver of the denoising steps (default ddim, as published; with --quality fast unipc)"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "dataset", "what captions.json and the manifests say (default: empty)"},
-    {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore",
+    {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore evaluate",
      "dit: scale of classifier-free guidance (default 6; 1 skips the unconditional pass and halves the work)"},
-    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore",
+    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore evaluate",
      "dit: use guidance only in the first FRACTION of the steps (default 1)"},
-    {"--strength", REAL, AT(strength), 0.001, 1, "FRACTION", "fix restore",
+    {"--strength", REAL, AT(strength), 0.001, 1, "FRACTION", "fix restore evaluate",
      "dit: start from the noised frames and run only the last FRACTION of the steps (default 1: from pure noise)"},
-    {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore",
+    {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore evaluate",
      "dit: if the output of the first block changes by less than this (e.g. 0.1) from one step to the next, reuse the\n"
      "last output of all other blocks (default 0: never)"},
-    {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore",
+    {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore evaluate",
      "dit: quantize most layers of the transformer to 8-bit integers; needs one byte of memory per weight"},
-    {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore",
+    {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore evaluate",
      "dit: matrix products of the transformer in bfloat16 if the processor supports it (AVX512_BF16); implied by\n"
      "--quality fast"},
-    {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore",
+    {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore evaluate",
      "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"
      "has never seen, then replace its learned positions"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
@@ -87,7 +107,7 @@ static const option_spec option_specs[] = {
      "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate|spread", "fix",
      "camera path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix evaluate", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
      "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
      "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
@@ -100,35 +120,35 @@ static const option_spec option_specs[] = {
     {"--compare", FLAG, AT(compare), 0, 0, NULL, "fix",
      "also train the same number of steps from the same start and seed without repair, and report both runs: the\n"
      "difference is what the repair alone contributes"},
-    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix dataset",
+    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix dataset evaluate",
      "approximations that are allowed (default balanced; exact allows none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png for each held-out view: the \"seen\" figures are measured over the white pixels (see gsfix masks)"},
-    {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix",
+    {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix evaluate",
      "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
      "on nor measured, grey ones count partially (default on)"},
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
      "background colour: black (default), white, R,G,B from 0 to 1, or (fix) random, a new one in each step"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
-    {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset", "go on with what an interrupted run has left in OUT"},
+    {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset evaluate", "go on with what an interrupted run has left in OUT"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",
      "start over even if OUT contains a checkpoint, which is then deleted"},
-    {"--restart", FLAG, AT(restart), 0, 0, NULL, "dataset", "begin anew even if OUT contains a run's results or checkpoints"},
-    {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset",
-     "only print the names of the tasks, one per scene, that gsfix_mpi distributes"},
-    {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset", "only do this task"},
+    {"--restart", FLAG, AT(restart), 0, 0, NULL, "dataset evaluate", "begin anew even if OUT contains a run's results or checkpoints"},
+    {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset evaluate",
+     "only print the names of the tasks (dataset: one per scene, evaluate: one per run), which gsfix_mpi distributes"},
+    {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset evaluate", "only do this task"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times per run and after every\n"
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
-    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset",
-     "write OUT/SCENE/checkpoint every N training steps (default: once a minute)"},
+    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
+     "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
     {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
      "also write OUT/splats.splat (no view-dependent colour) or OUT/splats.spz"},
-    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset",
+    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset evaluate",
      "override individual settings of the trainer and of the repair loop:"},
-    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset",
+    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset evaluate",
      "frames per sequence, both references included: longer captures are thinned out evenly (default 49); the captures of\n"
      "fewer photos are used as they are"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
@@ -149,7 +169,10 @@ static const option_spec option_specs[] = {
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage; with --models lpips_alex, lpips_vgg, lpips_squeeze on images in\n"
      "[-1,1], lpips_alex_raw ... on images in [0,1]; i2v_subject, i2v_background and motion_smoothness measure DIR_A\n"
      "as a clip, the first two against the first picture of DIR_B (default psnr,ssim_3dgs)"},
-    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
+    {"--which", TEXT, AT(which), 0, 0, "NAME,...", "evaluate",
+     "metrics of the tables besides PSNR and SSIM: lpips_vgg_raw (as published figures), and of restored sequences\n"
+     "i2v_subject, i2v_background, motion_smoothness (default: with --models all, else none)"},
+    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics evaluate", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
      "number of workers (default: all cores); results are bit-identical for any number"},
@@ -188,7 +211,8 @@ static const command_spec command_specs[] = {
      1, run_masks},
     {"dataset", "SCENE... --out DIR", "write paired sequences of artifact and clean frames, to train and judge restorers", -1,
      gsfix_run_dataset},
-    {"evaluate", "", "", 0, NULL}, // reserved: refused with "not in this version"
+    {"evaluate", "SCENE... --out DIR", "make the paper's tables and a gallery: restorers, trajectories and starts compared", -1,
+     gsfix_run_evaluate},
 };
 enum { COMMAND_COUNT = sizeof command_specs / sizeof command_specs[0] };
 
@@ -314,7 +338,7 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
     if (app->o.help) return 0;
     if (command->inputs < 0 ? app->o.input_count < -command->inputs : app->o.input_count != command->inputs)
         return gsfix_misused(app, "expected: gsfix %s %s", command->name, command->usage);
-    if (has_word("fix render filter path restore masks dataset", command->name) && !app->o.out)
+    if (has_word("fix render filter path restore masks dataset evaluate", command->name) && !app->o.out)
         return gsfix_misused(app, "--out is missing");
     if (app->o.factor && app->o.max_size) return gsfix_misused(app, "--factor and --max-size exclude each other");
     if (app->o.resume && app->o.restart) return gsfix_misused(app, "--resume and --restart exclude each other");
@@ -1148,9 +1172,10 @@ static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
     return result;
 }
 
-// Parses --which; 0 or an exit code. *nets: how many of the metrics need a network.
-static int choose_metrics(gsfix_app* app, const char* which, metric_run* run, int* nets) {
-    *nets = 0;
+static int run_metrics(gsfix_app* app) {
+    metric_run run = {0};
+    int nets = 0;
+    const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
@@ -1158,18 +1183,11 @@ static int choose_metrics(gsfix_app* app, const char* which, metric_run* run, in
         if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
         if (metric_specs[m].net >= 0 && !app->o.models)
             return gsfix_misused(app, "%s needs --models", metric_specs[m].name);
-        run->wanted[m] = 1;
-        *nets += metric_specs[m].net >= 0;
+        run.wanted[m] = 1;
+        nets += metric_specs[m].net >= 0;
         p += n;
-        if (!*p) return 0;
+        if (!*p) break;
     }
-}
-
-static int run_metrics(gsfix_app* app) {
-    metric_run run = {0};
-    int nets = 0;
-    const int code = choose_metrics(app, app->o.which ? app->o.which : "psnr,ssim_3dgs", &run, &nets);
-    if (code) return code;
     if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
     return compare_folders(app, &run) == GSF_OK ? 0 : gsfix_failed(app);
 }
@@ -1180,13 +1198,16 @@ struct gsfix_meter {
     size_t pairs;
 };
 
-int gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out) {
-    int nets = 0, code;
+gsf_result gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out) {
     *out = (gsfix_meter*)gsf_alloc_zeroed(&app->ctx, 1, sizeof **out);
-    if (!*out) return gsfix_failed(app);
-    code = choose_metrics(app, which, &(*out)->run, &nets);
-    if (!code && open_networks(app, &(*out)->run) != GSF_OK) code = gsfix_failed(app);
-    return code;
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    for (const char* p = which; *p; p += strspn(p, ",")) {
+        const size_t n = strcspn(p, ",");
+        for (int m = 0; m < METRIC_COUNT; m++)
+            if (strlen(metric_specs[m].name) == n && strncmp(metric_specs[m].name, p, n) == 0) (*out)->run.wanted[m] = 1;
+        p += n;
+    }
+    return open_networks(app, &(*out)->run);
 }
 
 gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
@@ -1601,10 +1622,13 @@ int main(int argc, char** argv) { return gsfix_start(argc, argv, NULL); }
 
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
 #include "gsfix_dataset.c"
+#include "gsfix_evaluate.c"
 #include "gsfix_exec.c"
 #include "gsfix_fix.c"
+#include "gsfix_gallery.c"
 #include "gsfix_out.c"
 #include "gsfix_report.c"
+#include "gsfix_tables.c"
 #include "gsfix_tasks.c"
 #include "gsfix_util.c"
 #endif

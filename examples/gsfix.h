@@ -18,9 +18,10 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
+    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
-    int clean_iterations;
+    int clean_iterations, seeds;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
     const char** inputs;
@@ -188,7 +189,8 @@ void gsfix_free_clip(gsfix_app* app, gsfix_clip* c);
 gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out); // as f32
 
 typedef struct gsfix_meter gsfix_meter; // mean values of metrics over pairs of images, and values of a clip
-int gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out); // opens the networks; 0 or an exit code
+// which: names, separated by commas, of metrics in this version. Opens their networks in --models. Destroy it after errors, too.
+gsf_result gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out);
 // truth NULL: the frame does not count for metrics of pairs; input: of the metrics of clips, NULL: the frame is not in a clip.
 gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
                              const gsf_image* input);
@@ -376,8 +378,14 @@ gsf_result gsfix_make_dataset_scene(gsfix_app* app, const gsfix_dataset_plan* pl
 int gsfix_has_dataset_scene(gsfix_app* app, const gsfix_dataset_plan* plan); // is o.out complete and made with these settings?
 gsf_result gsfix_load_sequence(gsf_context* ctx, gsfix_path path, gsfix_sequence* out);
 gsf_result gsfix_load_scene_manifest(gsf_context* ctx, const char* path, gsfix_scene_manifest* out);
+// Parses numbers of views of at least 2, separated by commas; 0 or an exit code.
+int gsfix_parse_views(gsfix_app* app, const char* text, int views[16], int* count);
 int gsfix_is_manifest(const char* path); // does the file begin as a manifest of this command does?
 // For `gsfix info`: the manifest of a sequence or of a scene; checks the digests of all its files.
 gsf_result gsfix_info_dataset(gsfix_app* app, const char* path);
+
+// ---- gsfix_evaluate.c ----------------------------------------------------------------
+
+int gsfix_run_evaluate(gsfix_app* app);
 
 #endif

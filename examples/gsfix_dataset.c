@@ -62,18 +62,18 @@ static int parse_kinds(gsfix_app* app, dataset_plan* plan) {
     }
 }
 
-static int parse_views(gsfix_app* app, dataset_plan* plan) {
-    const char* text = app->o.views ? app->o.views : "3";
+int gsfix_parse_views(gsfix_app* app, const char* text, int views[MAX_VIEW_COUNTS], int* count) {
+    *count = 0;
     for (const char* p = text;; p++) {
         char* end;
         const long k = strtol(p, &end, 10);
         int again = 0;
         if (end == p || (*end && *end != ',') || k < 2 || k > 1000)
             return gsfix_misused(app, "--views %s: expected numbers of at least 2, separated by commas", text);
-        for (int i = 0; i < plan->view_counts; i++) again |= plan->views[i] == k;
-        if (again || plan->view_counts == MAX_VIEW_COUNTS)
+        for (int i = 0; i < *count; i++) again |= views[i] == k;
+        if (again || *count == MAX_VIEW_COUNTS)
             return gsfix_misused(app, "--views %s: %s", text, again ? "a number stands there twice" : "too many");
-        plan->views[plan->view_counts++] = (int)k;
+        views[(*count)++] = (int)k;
         p = end;
         if (!*p) return 0;
     }
@@ -108,7 +108,7 @@ static void write_settings(gsfix_app* app, dataset_plan* plan) {
 
 static int resolve_plan(gsfix_app* app, dataset_plan* plan) { // 0 or an exit code
     int code = parse_kinds(app, plan);
-    if (!code) code = parse_views(app, plan);
+    if (!code) code = gsfix_parse_views(app, app->o.views ? app->o.views : "3", plan->views, &plan->view_counts);
     if (code) return code;
     plan->frames = app->o.frames ? app->o.frames : 49;
     plan->caption = app->o.caption ? app->o.caption : "";

@@ -119,7 +119,7 @@ static gsf_result run_in_order(gsfix_app* app, const char* out, gsfix_tally* tal
     return result == GSF_ERROR_CANCELLED ? result : GSF_OK;
 }
 
-static gsf_result run_all(gsfix_app* app, const gsfix_tasks* t, const char* out) {
+static gsf_result run_all(gsfix_app* app, const gsfix_tasks* t, const char* out, size_t* done) {
     gsf_context* ctx = &app->ctx;
     gsfix_tally tally = {t, NULL, 0, GSF_OK, ""};
     gsf_result result = GSF_OK;
@@ -133,6 +133,7 @@ static gsf_result run_all(gsfix_app* app, const gsfix_tasks* t, const char* out)
         result = run_in_order(app, out, &tally);
     }
     gsfix_json_end(ctx, &app->json, ']');
+    for (size_t i = 0; i < t->count; i++) *done += tally.done[i];
     gsf_free(ctx, tally.done);
     if (result != GSF_OK || !tally.failed) return result;
     if (t->count == 1) return gsf_fail(ctx, tally.why, "%s", tally.first);
@@ -176,10 +177,10 @@ int gsfix_run_tasks(gsfix_app* app, const gsfix_tasks* t) {
         result = open_merged(app, t, out); // refuses early what the merge could not do
         if (result == GSF_OK && app->o.list_tasks) result = list_tasks(app, t);
         else if (result == GSF_OK) {
-            result = run_all(app, t, out);
+            result = run_all(app, t, out, &i);
             if (result == GSF_OK) result = open_merged(app, t, out);
             if (result == GSF_OK) result = t->merge_fn(app, t->user);
-            else if (t->merges_partly && result != GSF_ERROR_CANCELLED) result = merge_partly(app, t, out, result);
+            else if (i && t->merges_partly && result != GSF_ERROR_CANCELLED) result = merge_partly(app, t, out, result);
         }
     }
     app->o.out = out;
