@@ -21,13 +21,15 @@
    - a task whose process crashes or is killed (by the kernel for lack of memory, say) is handed out again and continued from its
      checkpoint, at most SCHEDULE_TRIES times;
    - a rank that is killed takes its process along; rank 0 misses it after LOST_AFTER seconds (on its own machine within one) and
-     hands its task out again. mpirun must be told to carry on: --enable-recovery. Without workers rank 0 does the tasks itself;
+     hands its task out again. mpirun must be told to carry on: --enable-recovery. Without workers rank 0 does the tasks itself.
+     Workers that miss rank 0 in the same way exit;
    - a rank that was only slow does no harm: a task's folder is locked by the process at work in it, and the other one waits.
    Results do not depend on who does a task, so that the output is that of one process, byte for byte. If mpirun itself dies, the
    same command with --resume goes on. */
 enum { TAG_TO_WORKER = 1, TAG_TO_CHIEF = 2, TEXT_MOST = 400, BUSY_MOST = 600 };
-enum { ANSWER_STOP = -1, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
-static const double LOST_AFTER = 60.0, ALIVE_EVERY = 1.0;
+enum { ORDER_STOP = -1, ORDER_NONE = -2, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
+enum { START_MOST = 300, END_MOST = 10 }; // seconds until all ranks have started; for MPI to end where some are lost
+static const double LOST_AFTER = 60.0, ALIVE_EVERY = 1.0, LOOK_EVERY = 0.5, ORDER_EVERY = 10.0;
 
 typedef struct news { // from a worker
     int32_t kind, pid;
@@ -37,11 +39,12 @@ typedef struct news { // from a worker
 } news;
 
 typedef struct order { // to a worker
-    int64_t task;
-    int32_t again; // a try after the first one
-    char name[256];
+    int64_t task;       // or ORDER_STOP, or ORDER_NONE: says only that rank 0 lives
+    int32_t again, pid; // again: a try after the first one
+    char name[256], host[64];
 } order;
 
+// All messages are buffered sends (MPI_Bsend), since an ordinary one to a rank that has just died may never return.
 typedef struct mpi_job {
     int argc;
     char** argv;
@@ -126,61 +129,81 @@ static int has_ended(task_process* p, int32_t* kind) {
 
 static int is_busy(const task_process* p) { return strstr(p->last, "another gsfix is at work there") != NULL; }
 
-// ---- workers -------------------------------------------------------------------------
-
-static void send_news(news* n, int32_t kind) {
-    n->kind = kind;
-    MPI_Send(n, (int)sizeof *n, MPI_BYTE, 0, TAG_TO_CHIEF, MPI_COMM_WORLD);
+// Does a process with this number run on this machine, or on another one, of which that is not known?
+static int may_live(const char* host, int32_t pid) {
+    char mine[64] = "";
+    gethostname(mine, sizeof mine - 1);
+    return !pid || strcmp(host, mine) != 0 || kill(pid, 0) == 0 || errno != ESRCH;
 }
 
-static void do_order(const mpi_job* job, const order* o, news* n) {
+// ---- workers -------------------------------------------------------------------------
+
+typedef struct worker {
+    const mpi_job* job;
+    news n;
+    order last;           // what rank 0 said last
+    double said, heard;   // when
+} worker;
+
+static void send_news(worker* w, int32_t kind) {
+    w->n.kind = kind;
+    MPI_Bsend(&w->n, (int)sizeof w->n, MPI_BYTE, 0, TAG_TO_CHIEF, MPI_COMM_WORLD);
+    w->said = gsfix_now();
+}
+
+// Listens to rank 0, and says `kind` once a second. Exits if there is no rank 0 any more.
+static void keep_in_touch(worker* w, int32_t kind) {
+    int there = 0;
+    MPI_Iprobe(0, TAG_TO_WORKER, MPI_COMM_WORLD, &there, MPI_STATUS_IGNORE);
+    if (there) {
+        MPI_Recv(&w->last, (int)sizeof w->last, MPI_BYTE, 0, TAG_TO_WORKER, MPI_COMM_WORLD, MPI_STATUS_IGNORE);
+        w->heard = gsfix_now();
+    } else if (gsfix_now() - w->said > ALIVE_EVERY) {
+        if (!may_live(w->last.host, w->last.pid) || gsfix_now() - w->heard > 2.0 * LOST_AFTER) _exit(1); // takes the task along
+        send_news(w, kind);
+    }
+}
+
+static void do_order(worker* w) {
+    const order o = w->last;
     int32_t kind = NEWS_KILLED;
-    double said = gsfix_now();
-    const double begin = said;
-    int tries = o->again;
+    const double begin = gsfix_now();
     task_process p;
-    n->task = o->task;
-    n->text[0] = 0;
-    for (int running = start_process(job, o->name, tries, &p); running;) {
-        if (gsfix_now() - said > ALIVE_EVERY) {
-            send_news(n, NEWS_ALIVE);
-            said = gsfix_now();
-        }
+    w->n.task = o.task;
+    w->n.text[0] = 0;
+    for (int running = start_process(w->job, o.name, o.again, &p); running;) {
+        keep_in_touch(w, NEWS_ALIVE);
+        if (w->last.task == ORDER_STOP) kill(p.pid, SIGINT); // leaves a checkpoint
         if (!has_ended(&p, &kind)) {
             pause_for(0.001);
-        } else if (kind == NEWS_FAILED && is_busy(&p) && gsfix_now() - begin < BUSY_MOST) {
+        } else if (kind == NEWS_FAILED && is_busy(&p) && gsfix_now() - begin < BUSY_MOST && w->last.task != ORDER_STOP) {
             pause_for(0.5); // the process of a rank that is thought lost; what it does counts, too
-            running = start_process(job, o->name, 1, &p);
+            running = start_process(w->job, o.name, 1, &p);
         } else {
             running = 0;
         }
     }
-    n->seconds = gsfix_now() - begin;
-    snprintf(n->text, sizeof n->text, "%s", p.last);
-    send_news(n, kind);
+    w->n.seconds = gsfix_now() - begin;
+    snprintf(w->n.text, sizeof w->n.text, "%s", p.last);
+    send_news(w, kind);
 }
 
 static void work(const mpi_job* job) {
-    news n;
-    memset(&n, 0, sizeof n);
-    n.pid = (int32_t)getpid();
-    gethostname(n.host, sizeof n.host - 1);
-    n.task = -1;
-    send_news(&n, NEWS_READY);
-    for (double said = gsfix_now();;) {
-        order o;
-        int there = 0;
-        MPI_Iprobe(0, TAG_TO_WORKER, MPI_COMM_WORLD, &there, MPI_STATUS_IGNORE);
-        if (!there) {
+    static worker w; // zeroed
+    w.job = job;
+    w.heard = gsfix_now();
+    w.n.pid = (int32_t)getpid();
+    gethostname(w.n.host, sizeof w.n.host - 1);
+    w.n.task = w.last.task = ORDER_NONE;
+    for (send_news(&w, NEWS_READY); w.last.task != ORDER_STOP;) {
+        keep_in_touch(&w, NEWS_READY);
+        if (w.last.task >= 0) {
+            do_order(&w);
+            w.n.task = ORDER_NONE;
+            if (w.last.task >= 0) w.last.task = ORDER_NONE; // done, and nothing came meanwhile
+        } else {
             pause_for(0.001);
-            if (gsfix_now() - said > ALIVE_EVERY) send_news(&n, NEWS_READY), said = gsfix_now();
-            continue;
         }
-        MPI_Recv(&o, (int)sizeof o, MPI_BYTE, 0, TAG_TO_WORKER, MPI_COMM_WORLD, MPI_STATUS_IGNORE);
-        if (o.task == ANSWER_STOP) return;
-        do_order(job, &o, &n);
-        n.task = -1;
-        said = gsfix_now();
     }
 }
 
@@ -191,14 +214,15 @@ typedef struct chief {
     const mpi_job* job;
     gsfix_tally* tally;
     schedule s;
-    int32_t* pids;     // per worker, of those on this machine; 0: not known
+    news* known;       // per worker: its last message
     uint8_t* idle;     // per worker: waits for an order
-    char host[64], why[TEXT_MOST]; // why: text of the report at hand
+    char why[TEXT_MOST];           // text of the report at hand
     double seconds;                // of the report at hand
     int by;
 } chief;
 
-static uint8_t* lost_ranks; // of each rank; MPI_Finalize would wait for them
+static uint8_t* lost_ranks; // per rank; no messages to these
+static int workers_stopped;
 
 static void on_end(void* user, size_t task, int ok) {
     chief* c = (chief*)user;
@@ -217,33 +241,47 @@ static void on_end(void* user, size_t task, int ok) {
     if (ok) gsfix_note(app, "%zu of %zu: %s, rank %d, %.1f s", c->s.ended, t->count, t->names[task], c->by, c->seconds);
 }
 
-static void give_order(chief* c, size_t worker, size_t task) {
+static void send_order(order* o, int rank) {
+    o->pid = (int32_t)getpid();
+    gethostname(o->host, sizeof o->host - 1);
+    MPI_Bsend(o, (int)sizeof *o, MPI_BYTE, rank, TAG_TO_WORKER, MPI_COMM_WORLD);
+}
+
+static void give_order(chief* c, size_t worker_index, size_t task) {
     order o;
     memset(&o, 0, sizeof o);
     o.task = (int64_t)task;
     o.again = c->s.tasks[task].tries > 1;
     snprintf(o.name, sizeof o.name, "%s", c->tally->tasks->names[task]);
-    c->idle[worker] = 0;
-    MPI_Send(&o, (int)sizeof o, MPI_BYTE, (int)worker + 1, TAG_TO_WORKER, MPI_COMM_WORLD); // short: does not wait for the worker
+    c->idle[worker_index] = 0;
+    send_order(&o, (int)worker_index + 1);
 }
 
-static void hear(chief* c, size_t worker, const news* n) {
+static void send_to_all(int ranks, int64_t task) {
+    order o;
+    memset(&o, 0, sizeof o);
+    o.task = task;
+    for (int i = 1; i < ranks; i++)
+        if (!lost_ranks[i]) send_order(&o, i);
+}
+
+static void hear(chief* c, size_t from, const news* n) {
     const int known = n->task >= 0 && (size_t)n->task < c->s.task_count;
-    schedule_hear(&c->s, worker, gsfix_now());
-    lost_ranks[worker + 1] = 0;
-    c->pids[worker] = strcmp(n->host, c->host) == 0 ? n->pid : 0;
-    c->by = (int)worker + 1;
+    schedule_hear(&c->s, from, gsfix_now());
+    lost_ranks[from + 1] = 0;
+    c->known[from] = *n;
+    c->by = (int)from + 1;
     c->seconds = n->seconds;
     snprintf(c->why, sizeof c->why, "%.*s", TEXT_MOST - 1, n->text);
     if (n->kind == NEWS_ALIVE) return;
     if (known && n->kind == NEWS_KILLED) {
         gsfix_note(c->app, "%s: its process on rank %d: %s", c->tally->tasks->names[n->task], c->by,
                    n->text[0] ? n->text : "could not be started");
-        schedule_retry(&c->s, worker, on_end, c);
+        schedule_retry(&c->s, from, on_end, c);
     } else if (known) {
-        schedule_report(&c->s, worker, (size_t)n->task, n->kind == NEWS_DONE, on_end, c);
+        schedule_report(&c->s, from, (size_t)n->task, n->kind == NEWS_DONE, on_end, c);
     }
-    c->idle[worker] = c->s.workers[worker].task == SCHEDULE_NONE; // else an order is on its way
+    c->idle[from] = c->s.workers[from].task == SCHEDULE_NONE; // else an order is on its way
 }
 
 static int receive(chief* c) { // a message, if there is one
@@ -260,8 +298,8 @@ static int receive(chief* c) { // a message, if there is one
 static void look_for_lost(chief* c) {
     const double now = gsfix_now();
     for (size_t w = 0; w < c->s.worker_count; w++) {
-        const int gone = c->pids[w] && kill(c->pids[w], 0) != 0 && errno == ESRCH;
-        if (c->s.workers[w].lost || (!gone && now - c->s.workers[w].heard < LOST_AFTER)) continue;
+        if (c->s.workers[w].lost) continue;
+        if (may_live(c->known[w].host, c->known[w].pid) && now - c->s.workers[w].heard < LOST_AFTER) continue;
         const size_t task = c->s.workers[w].task;
         gsfix_note(c->app, "rank %d is lost%s%s", (int)w + 1, task == SCHEDULE_NONE ? "" : ", and hands back ",
                    task == SCHEDULE_NONE ? "" : c->tally->tasks->names[task]);
@@ -295,17 +333,16 @@ static gsf_result lead(gsfix_app* app, void* user, gsfix_tally* tally) {
     gsf_context* ctx = &app->ctx;
     chief c;
     int ranks;
-    double looked = gsfix_now();
+    double looked = gsfix_now(), ordered = looked;
     gsf_result result = GSF_OK;
     memset(&c, 0, sizeof c);
     MPI_Comm_size(MPI_COMM_WORLD, &ranks);
     c.app = app;
     c.job = (const mpi_job*)user;
     c.tally = tally;
-    c.pids = (int32_t*)gsf_alloc_zeroed(ctx, (size_t)ranks, sizeof *c.pids);
+    c.known = (news*)gsf_alloc_zeroed(ctx, (size_t)ranks, sizeof *c.known);
     c.idle = (uint8_t*)gsf_alloc_zeroed(ctx, (size_t)ranks, 1);
-    gethostname(c.host, sizeof c.host - 1);
-    if (!schedule_begin(&c.s, tally->tasks->count, tally->tasks->needs, (size_t)ranks - 1, looked) || !c.pids || !c.idle)
+    if (!schedule_begin(&c.s, tally->tasks->count, tally->tasks->needs, (size_t)ranks - 1, looked) || !c.known || !c.idle)
         result = GSF_ERROR_OUT_OF_MEMORY;
     while (result == GSF_OK && !schedule_is_over(&c.s)) {
         const int heard = receive(&c);
@@ -315,15 +352,21 @@ static gsf_result lead(gsfix_app* app, void* user, gsfix_tally* tally) {
             if (task == SCHEDULE_NONE) break;
             give_order(&c, w, task);
         }
-        if (gsfix_now() - looked > 0.5) {
+        if (gsfix_now() - looked > LOOK_EVERY) {
             look_for_lost(&c);
             looked = gsfix_now();
+        }
+        if (looked - ordered > ORDER_EVERY) {
+            send_to_all(ranks, ORDER_NONE);
+            ordered = looked;
         }
         if (!c.s.alive) work_alone(&c);
         else if (!heard) pause_for(0.0005);
         if (gsf_is_cancelled(ctx)) result = gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped; --resume goes on");
     }
-    gsf_free(ctx, c.pids);
+    send_to_all(ranks, ORDER_STOP);
+    workers_stopped = 1;
+    gsf_free(ctx, c.known);
     gsf_free(ctx, c.idle);
     schedule_end(&c.s);
     return result;
@@ -331,38 +374,46 @@ static gsf_result lead(gsfix_app* app, void* user, gsfix_tally* tally) {
 
 // ---- main ----------------------------------------------------------------------------
 
-static void stop_workers(int ranks) {
-    order o;
-    memset(&o, 0, sizeof o);
-    o.task = ANSWER_STOP;
-    for (int i = 1; i < ranks; i++)
-        if (!lost_ranks[i]) MPI_Send(&o, (int)sizeof o, MPI_BYTE, i, TAG_TO_WORKER, MPI_COMM_WORLD);
+static volatile sig_atomic_t exit_code = 1, is_ending;
+
+static void on_alarm(int number) { // MPI waits for ranks that are lost
+    static const char text[] = "gsfix_mpi: not all ranks have started\n";
+    (void)number;
+    if (!is_ending) (void)!write(2, text, sizeof text - 1);
+    _exit(exit_code);
 }
 
 int main(int argc, char** argv) {
     mpi_job job = {argc, argv, 0, 0};
     const gsfix_crew crew = {lead, &job};
-    int rank, ranks, code = 0, any_lost = 0;
+    int rank, ranks, code = 0;
     for (int i = 1; i < argc; i++) {
         if (strcmp(argv[i], "--task") == 0 || strncmp(argv[i], "--task=", 7) == 0) return gsfix_start(argc, argv, NULL);
         job.quiet |= strcmp(argv[i], "--json") == 0;
         job.resumes |= strcmp(argv[i], "--resume") == 0 || strcmp(argv[i], "--restart") == 0;
     }
+    signal(SIGALRM, on_alarm);
+    alarm(START_MOST);
     MPI_Init(&argc, &argv);
+    alarm(0);
     MPI_Comm_set_errhandler(MPI_COMM_WORLD, MPI_ERRORS_RETURN);
     MPI_Comm_rank(MPI_COMM_WORLD, &rank);
     MPI_Comm_size(MPI_COMM_WORLD, &ranks);
+    const int buffer_size = (8 * ranks + 256) * (int)(sizeof(news) + MPI_BSEND_OVERHEAD);
+    void* buffer = malloc((size_t)buffer_size);
     lost_ranks = (uint8_t*)calloc((size_t)ranks, 1);
-    if (!lost_ranks) MPI_Abort(MPI_COMM_WORLD, 1);
-    if (rank > 0) {
-        work(&job);
-    } else {
-        code = gsfix_start(argc, argv, &crew);
-        stop_workers(ranks);
-    }
-    for (int i = 0; i < ranks; i++) any_lost |= lost_ranks[i];
-    (void)any_lost;
+    if (!lost_ranks || !buffer) MPI_Abort(MPI_COMM_WORLD, 1);
+    MPI_Buffer_attach(buffer, buffer_size);
+    if (rank > 0) work(&job);
+    else code = gsfix_start(argc, argv, &crew);
+    if (rank == 0 && !workers_stopped) send_to_all(ranks, ORDER_STOP); // a mistake in the command line
+    fflush(stdout);
+    exit_code = code;
+    is_ending = 1;
+    for (int i = 0; i < ranks; i++)
+        if (lost_ranks[i]) alarm(END_MOST);
     MPI_Finalize();
     free(lost_ranks);
+    free(buffer);
     return code;
 }
