@@ -28,7 +28,7 @@
    same command with --resume goes on. */
 enum { TAG_TO_WORKER = 1, TAG_TO_CHIEF = 2, TEXT_MOST = 400, BUSY_MOST = 600 };
 enum { ORDER_STOP = -1, ORDER_NONE = -2, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
-enum { START_MOST = 300, END_MOST = 10 }; // seconds until all ranks have started; for MPI to end where some are lost
+enum { START_MOST = 300, END_MOST = 10, MERGE_MOST = 3600 }; // seconds until all have started, for MPI to end, for merging
 static const double LOST_AFTER = 60.0, ALIVE_EVERY = 1.0, LOOK_EVERY = 0.5, ORDER_EVERY = 10.0;
 
 typedef struct news { // from a worker
@@ -410,8 +410,10 @@ int main(int argc, char** argv) {
     fflush(stdout);
     exit_code = code;
     is_ending = 1;
+    int patience = rank > 0 ? MERGE_MOST : 6 * END_MOST; // a rank may be killed even now, and then MPI would wait for ever
     for (int i = 0; i < ranks; i++)
-        if (lost_ranks[i]) alarm(END_MOST);
+        if (lost_ranks[i]) patience = END_MOST;
+    alarm((unsigned)patience);
     MPI_Finalize();
     free(lost_ranks);
     free(buffer);
