@@ -189,7 +189,8 @@ void gsfix_free_clip(gsfix_app* app, gsfix_clip* c);
 gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out); // as f32
 
 typedef struct gsfix_meter gsfix_meter; // mean values of metrics over pairs of images, and values of a clip
-// which: names, separated by commas, of metrics in this version. Opens their networks in --models. Destroy it after errors, too.
+// which: names of metrics in this version, separated by commas. Opens their networks in --models. To be destroyed after errors,
+// too.
 gsf_result gsfix_make_meter(gsfix_app* app, const char* which, gsfix_meter** out);
 // truth NULL: the frame does not count for metrics of pairs; input: of the metrics of clips, NULL: the frame is not in a clip.
 gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,

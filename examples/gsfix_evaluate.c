@@ -10,8 +10,8 @@
        SCENE.artifacts.kK.sSEED              gsfix dataset: sequences of artifact and clean frames
        SCENE.restored.ARM[.CONDITION].sSEED  restores these sequences (ARM artifacts: only measures them)
            sequence_00/frame_00001.png ..., result.json
-   OUT itself gets tables.md, tables.tex, tables.csv, runs.csv and gallery.html, from what these folders hold. They do not depend
-   on the order of the runs, on interruptions or on time, so that they are the same bytes whoever did the tasks.
+   OUT itself gets tables.md, tables.tex, tables.csv, runs.csv and gallery.html, from what these folders hold. They do not
+   depend on the order of the runs, on interruptions or on time, so that they are the same bytes whoever did the tasks.
    A run is finished if its result.json was made with the present settings and no checkpoint is beside it. */
 
 const eval_score eval_scores[EVAL_SCORES] = {
@@ -64,13 +64,14 @@ static void eval_name_arms(eval_plan* plan, const eval_list* restorers) {
     for (int i = 0; i < restorers->count; i++) {
         eval_arm* arm = &plan->arms[plan->arm_count++];
         const char* r = restorers->items[i];
+        const int n = (int)strcspn(r, ":"), shown = n < 20 ? n : 20;
         int same = 0;
         arm->plain = strcmp(r, "plain") == 0;
         arm->restorer = arm->plain || strcmp(r, "none") == 0 ? NULL : r;
-        for (int k = 0; k < i; k++) same += strcspn(restorers->items[k], ":") == strcspn(r, ":") &&
-                                            strncmp(restorers->items[k], r, strcspn(r, ":")) == 0;
-        snprintf(arm->name, sizeof arm->name, same ? "%.*s-%d" : "%.*s", (int)strcspn(r, ":") > 20 ? 20 : (int)strcspn(r, ":"), r,
-                 same + 1);
+        for (int k = 0; k < i; k++)
+            same += (int)strcspn(restorers->items[k], ":") == n && strncmp(restorers->items[k], r, (size_t)n) == 0;
+        if (same) snprintf(arm->name, sizeof arm->name, "%.*s-%d", shown, r, same + 1);
+        else snprintf(arm->name, sizeof arm->name, "%.*s", shown, r);
     }
     plan->artifacts = plan->arm_count;
     snprintf(plan->arms[plan->artifacts].name, sizeof plan->arms->name, "artifacts");
@@ -128,9 +129,9 @@ static int eval_choose_tables(gsfix_app* app, eval_plan* plan, char* text) {
 
 static int eval_parse(gsfix_app* app, eval_plan* plan) { // 0 or an exit code
     const gsfix_options* o = &plan->given;
-    const char* const given[] = {o->restorers ? o->restorers : "plain,none,warp", o->trajectories ? o->trajectories : "reference",
-                                 o->inits ? o->inits : "tracks", o->conditions ? o->conditions : "both",
-                                 o->tables ? o->tables : "", o->which ? o->which : ""};
+    const char* const given[] = {o->restorers ? o->restorers : "plain,none,warp",
+                                 o->trajectories ? o->trajectories : "reference", o->inits ? o->inits : "tracks",
+                                 o->conditions ? o->conditions : "both", o->tables ? o->tables : "", o->which ? o->which : ""};
     enum { LISTS = sizeof given / sizeof *given };
     eval_list restorers;
     char* texts[LISTS];
@@ -619,7 +620,7 @@ static gsf_result eval_restore_sequence(eval_job* job, const eval_sequences* s, 
     return result;
 }
 
-// Measures the frames as written. Metrics of pairs leave out the references, which are known; clips are measured with both ends.
+// Measures the frames as written. Metrics of pairs leave out the references, which are known; clips include both ends.
 static gsf_result eval_measure_sequence(eval_job* job, const eval_sequences* s, size_t i, double scores[EVAL_SCORES],
                                         size_t* frames) {
     gsf_context* ctx = &job->app->ctx;
@@ -765,6 +766,8 @@ static gsf_result eval_run_task(gsfix_app* app, void* user, size_t task) {
     eval_end(&job);
     app->started = started;
     if (result == GSF_OK) gsfix_json_number(&app->ctx, &app->json, "seconds", gsfix_now() - begin);
+    if (result == GSF_OK && plan->runs[task].kind != EVAL_ARTIFACTS)
+        gsfix_print(app, "%-44s %.1f s", plan->names[task], gsfix_now() - begin);
     return result;
 }
 

@@ -61,6 +61,8 @@ gsf_result eval_load_sequences(gsf_context* ctx, gsfix_path folder, eval_sequenc
 void eval_free_sequences(gsf_context* ctx, eval_sequences* s);
 gsfix_path eval_frame_name(size_t sequence, const gsfix_sequence_frame* frame); // of a restored frame in its task's folder
 
+void eval_name_arm(const eval_arm* arm, eval_kind kind, char* to, size_t size); // what a row of ours is called
+
 gsf_result eval_write_tables(gsfix_app* app, const eval_plan* plan);  // gsfix_tables.c: tables.md, tables.tex, tables.csv
 gsf_result eval_write_gallery(gsfix_app* app, const eval_plan* plan); // gsfix_gallery.c: gallery.html
 

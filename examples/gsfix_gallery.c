@@ -4,7 +4,7 @@
 
 #include <math.h>
 
-/* A group shows one scene in one setting: the photo and what each method makes of it, frame by frame, from the first seed and
+/* A group shows one scene in one setting: the photo and what each method makes of it, frame by frame, of the first seed and
    the first start. Its pictures are sets of JPEGs in a JSON object; the script plays all groups in step, draws the comparison
    with its divider, and computes the error maps. Photos are stored once per scene. */
 enum {
@@ -58,7 +58,10 @@ typedef struct gallery_group {
     int64_t width, height;
 } gallery_group;
 
-static void add_set(gallery* g, gallery_group* group, const char* name, const eval_run* run) {
+// run NULL: the photos.
+static void add_set(gallery* g, gallery_group* group, const eval_run* run) {
+    char name[96] = "photo";
+    if (run) eval_name_arm(&g->plan->arms[run->arm], run->kind, name, sizeof name);
     group->names[group->count] = gsfix_pathf("%s", name);
     group->notes[group->count] = gsfix_pathf("%s", "");
     if (run && !isnan(run->scores[0]))
@@ -96,7 +99,7 @@ static void put_group(gallery* g, const gallery_group* group) { // after its set
 static gsf_result put_photos(gallery* g, gsf_scene* scene, const uint32_t* views, size_t count, gallery_group* group) {
     const size_t shown = count < (size_t)g->frames ? count : (size_t)g->frames;
     gsf_result result = GSF_OK;
-    add_set(g, group, "photo", NULL);
+    add_set(g, group, NULL);
     begin_set(g);
     for (size_t i = 0; i < shown && result == GSF_OK; i++) {
         const size_t view = views[thin_out(i, shown, count)];
@@ -114,7 +117,7 @@ static gsf_result put_photos(gallery* g, gsf_scene* scene, const uint32_t* views
 
 static gsf_result put_method(gallery* g, gallery_group* group, const eval_run* run, size_t count) {
     gsf_result result = GSF_OK;
-    add_set(g, group, g->plan->arms[run->arm].name, run);
+    add_set(g, group, run);
     begin_set(g);
     for (size_t i = 0; i < group->frames && result == GSF_OK; i++)
         result = put_file(g, gsfix_pathf("%s/%s/pictures/%02zu.jpg", g->app->o.out, g->plan->names[run - g->plan->runs],
@@ -184,13 +187,13 @@ static gsf_result put_reconstructions(gallery* g, int index) {
 // ---- restoration -----------------------------------------------------------------------------
 
 // All sequences of a scene one after the other; the reference between two of them is shown once.
-static gsf_result put_sequences(gallery* g, gallery_group* group, const eval_sequences* s, const char* name, const eval_run* run,
-                                int file, uint8_t* photos) {
+static gsf_result put_sequences(gallery* g, gallery_group* group, const eval_sequences* s, const eval_run* run, int file,
+                                uint8_t* photos) {
     gsf_result result = GSF_OK;
     size_t total = 1;
     for (size_t i = 0; i < s->count; i++) total += s->items[i].frame_count - 1;
     group->frames = total < (size_t)g->frames ? total : (size_t)g->frames;
-    add_set(g, group, name, run);
+    add_set(g, group, run);
     begin_set(g);
     for (size_t shown = 0; shown < group->frames && result == GSF_OK; shown++) {
         size_t at = thin_out(shown, group->frames, total), i = 0;
@@ -218,8 +221,8 @@ static gsf_result put_restorations(gallery* g, int index) {
     group.scene = plan->scenes[index];
     group.photos = photos;
     group.title = gsfix_pathf("restoration of a sequence, %d photos", plan->views[0]);
-    if (result == GSF_OK) result = put_sequences(g, &group, &s, "photo", NULL, GSFIX_CLEAN, photos);
-    if (result == GSF_OK) result = put_sequences(g, &group, &s, "artifacts", artifacts, GSFIX_ARTIFACT, photos);
+    if (result == GSF_OK) result = put_sequences(g, &group, &s, NULL, GSFIX_CLEAN, photos);
+    if (result == GSF_OK) result = put_sequences(g, &group, &s, artifacts, GSFIX_ARTIFACT, photos);
     if (result == GSF_OK) {
         const double shrink = s.items[0].width > s.items[0].height ? GALLERY_SIDE / (double)s.items[0].width
                                                                     : GALLERY_SIDE / (double)s.items[0].height;
@@ -231,7 +234,7 @@ static gsf_result put_restorations(gallery* g, int index) {
         like.arm = arm;
         like.condition = strncmp(plan->arms[arm].restorer, "dit:", 4) == 0 ? plan->main_condition : -1;
         const eval_run* run = eval_find(plan, &like, index, 0);
-        if (run && run->done) result = put_sequences(g, &group, &s, plan->arms[arm].name, run, -1, photos);
+        if (run && run->done) result = put_sequences(g, &group, &s, run, -1, photos);
     }
     if (result == GSF_OK) put_group(g, &group);
     eval_free_sequences(g->ctx, &s);
@@ -276,16 +279,16 @@ static const char* const gallery_script[] = { // in pieces, since C guarantees s
     " g.small.forEach(function(c,k){var p=shown(g,k,i);if(p)c.getContext('2d').drawImage(p,0,0,c.width,c.height)});\n",
     " var l=shown(g,+g.left.value,i),r=shown(g,+g.right.value,i);if(r)x.drawImage(r,0,0,w,h);\n",
     " if(l){x.save();x.beginPath();x.rect(0,0,s,h);x.clip();x.drawImage(l,0,0,w,h);x.restore()}\n",
-    " x.fillStyle='#fff';x.fillRect(s-1,0,2,h);x.beginPath();x.arc(s,h/2,13,0,7);x.fill();x.fillStyle='#222';x.font='16px sans-serif';\n",
+    " x.fillStyle='#fff';x.fillRect(s-1.5,0,3,h);x.beginPath();x.arc(s,h/2,22,0,7);x.fill();x.fillStyle='#222';x.font='26px sans-serif';\n",
     " x.textAlign='center';x.textBaseline='middle';x.fillText('\\u2194',s,h/2+1);\n",
-    " x.font='600 14px system-ui,sans-serif';x.textBaseline='bottom';tag(x,g.sets[+g.left.value].name,8,h-8,'left');\n",
-    " tag(x,g.sets[+g.right.value].name,w-8,h-8,'right');\n",
+    " x.font='600 20px system-ui,sans-serif';x.textBaseline='bottom';tag(x,g.sets[+g.left.value].name,12,h-12,'left');\n",
+    " tag(x,g.sets[+g.right.value].name,w-12,h-12,'right');\n",
     " g.badge.textContent='frame '+(i+1)+' of '+g.photos.length+['',', trained on this photo',', photo held out'][g.photos[i]]}\n",
-    "function tag(x,text,at,y,side){var w=x.measureText(text).width+14;x.fillStyle='rgba(0,0,0,.62)';x.fillRect(side==='left'?at:at-w,y-22,w,22);\n",
-    " x.fillStyle='#fff';x.textAlign='center';x.fillText(text,side==='left'?at+w/2:at-w/2,y-3)}\n",
+    "function tag(x,text,at,y,side){var w=x.measureText(text).width+20;x.fillStyle='rgba(0,0,0,.62)';x.fillRect(side==='left'?at:at-w,y-30,w,30);\n",
+    " x.fillStyle='#fff';x.textAlign='center';x.fillText(text,side==='left'?at+w/2:at-w/2,y-4)}\n",
     "var due=0;function later(){if(!due)due=requestAnimationFrame(function(){due=0;groups.forEach(function(g){if(g.visible)draw(g)})})}\n",
     "d.groups.forEach(function(g){var s=make('section',body),h=make('h2',s,g.scene);make('small',h,g.title);var row=make('div',s);row.className='group';\n",
-    " var one=make('div',row),big=make('div',one);big.className='big';g.big=make('canvas',big);var z=Math.max(1,Math.min(2,640/g.w));\n",
+    " var one=make('div',row),big=make('div',one);big.className='big';g.big=make('canvas',big);var z=960/g.w;\n",
     " g.big.width=Math.round(g.w*z);g.big.height=Math.round(g.h*z);g.big.style.width='100%';\n",
     " if(g.h>g.w){big.style.maxWidth=Math.round(520*g.w/g.h)+'px'}\n",
     " g.split=make('input',big);g.split.type='range';g.split.max=1000;g.split.value=500;g.split.setAttribute('aria-label','divider between the two pictures');\n",
@@ -329,8 +332,8 @@ static void put_introduction(gallery* g, int shown) {
     gsfix_put_head(p, "gsfixer: gallery of an evaluation");
     gsfix_put_lines(p, gallery_style);
     gsfix_put(p, "<p class=eyebrow>gsfix evaluate</p><h1>Gallery</h1><p class=lede>What each method makes of %s, beside the "
-                 "photos, frame by frame. Reconstructions are rendered along the whole capture; the badge says whether a frame's "
-                 "photo was trained on.</p><p class=small>Pictures of the first seed and of the start <em>%s</em>; figures are "
+                 "photos, frame by frame. Reconstructions are rendered along the whole capture; below each comparison stands whether "
+                 "the frame's photo was trained on or held out.</p><p class=small>Pictures of the first seed and of the start <em>%s</em>; figures are "
                  "means over the held-out photos, or over the frames between the references of a sequence. "
                  "Drag the divider to compare two methods. Tables: tables.md, tables.tex, tables.csv.",
               plan->scene_count == 1 ? "a scene" : "the scenes", plan->inits.items[0]);

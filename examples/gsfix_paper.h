@@ -3,8 +3,8 @@
 #ifndef GSFIX_PAPER_H
 #define GSFIX_PAPER_H
 
-// Columns of restoration: PSNR, SSIM, LPIPS, I2V_SC, I2V_BC, OC, TF, MS; of reconstruction: PSNR of 3, 6, 9 views, SSIM of 3, 6,
-// 9, LPIPS of 3, 6, 9; of trajectories: PSNR, SSIM, LPIPS.
+// Columns of restoration: PSNR, SSIM, LPIPS, I2V_SC, I2V_BC, OC, TF, MS; of reconstruction: PSNR of 3, 6, 9 views, then SSIM
+// and LPIPS likewise; of trajectories: PSNR, SSIM, LPIPS.
 typedef struct paper_row { const char* name; double values[9]; } paper_row;
 
 static const paper_row paper_restoration[] = { // DL3DV-Res, 137 scenes

@@ -1,4 +1,4 @@
-// gsfix_schedule.h - hands tasks out to workers of which any may be lost: the decisions of gsfix_mpi, without messages or clocks
+// gsfix_schedule.h - hands tasks out to workers of which any may be lost: gsfix_mpi's decisions, without messages or clocks
 // SPDX-License-Identifier: MIT
 #ifndef GSFIX_SCHEDULE_H
 #define GSFIX_SCHEDULE_H
@@ -7,9 +7,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* A task is handed out once it is ready: in order, and only after the one that it needs. A worker has one task at a time. It is
-   lost if it has been silent for too long; its task is then ready again, unless it has been tried SCHEDULE_TRIES times. A worker
-   that was thought lost may still report: the first report of success counts. Each call takes constant time. */
+/* A task is handed out once it is ready: in order, and only after the one that it needs. A worker has one task at a time. If it
+   is lost, its task is ready again, unless it has been tried SCHEDULE_TRIES times. A worker that was thought lost may still
+   report: the first report of success counts. Each call takes constant time. */
 enum { SCHEDULE_TRIES = 4 };
 #define SCHEDULE_NONE SIZE_MAX
 typedef enum schedule_state { SCHEDULE_WAITS, SCHEDULE_RUNS, SCHEDULE_DONE, SCHEDULE_FAILED } schedule_state;

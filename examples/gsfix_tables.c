@@ -107,12 +107,11 @@ static void set_cell(table_row* row, int column, figure f) {
     if (f.scenes && (!row->scenes || f.scenes < row->scenes)) row->scenes = f.scenes;
 }
 
-// What a row of ours is called.
-static void name_arm(const eval_arm* arm, char* to, size_t size) {
+void eval_name_arm(const eval_arm* arm, eval_kind kind, char* to, size_t size) {
     if (arm->plain) copy_name(to, size, "3DGS (plain)");
     else if (strcmp(arm->name, "artifacts") == 0) copy_name(to, size, "Artifact");
     else if (!arm->restorer) copy_name(to, size, "3DGS, regularised (none)");
-    else copy_name(to, size, "repaired by %s", arm->name);
+    else copy_name(to, size, kind == EVAL_RECONSTRUCTION ? "repaired by %s" : "restored by %s", arm->name);
 }
 
 static const char* start_of(const eval_plan* plan, int init) { return init >= 0 ? plan->inits.items[init] : "tracks"; }
@@ -189,8 +188,10 @@ static void add_same_scenes(tables* w, table* t, const paper_table* p, int metho
             for (int v = 0; v < (by_views ? 3 : 1); v++) {
                 double sum = 0.0;
                 if (by_views && printed[v] != plan->views[k]) continue;
-                for (int i = 0; i < plan->scene_count; i++)
-                    sum += find_scene(plan->scenes[i], p->scenes, p->scene_count)->values[3 * (v * p->method_count + method) + s];
+                for (int i = 0; i < plan->scene_count; i++) {
+                    const paper_scene* scene = find_scene(plan->scenes[i], p->scenes, p->scene_count);
+                    sum += scene->values[3 * (v * p->method_count + method) + s];
+                }
                 row->mean[by_views ? s * plan->view_counts + k : s] = sum / plan->scene_count;
             }
 }
@@ -418,7 +419,7 @@ static void write_restoration(tables* w) {
     add_printed(w, &t, &p, NULL, "Artifact", 0);
     for (int arm = 0; arm < plan->arm_count; arm++) {
         if (!plan->arms[arm].restorer) continue;
-        name_arm(&plan->arms[arm], name, sizeof name);
+        eval_name_arm(&plan->arms[arm], EVAL_RESTORATION, name, sizeof name);
         like = like_restoration(plan, arm, is_dit(plan, arm) ? plan->main_condition : -1);
         add_restoration_row(w, &t, name, &like);
     }
@@ -475,7 +476,7 @@ static void write_scenes(tables* w, table* t, const paper_table* p, int views, c
     }
     for (int m = 0; m < count; m++) {
         if (t->column_count + 3 > TABLE_COLUMNS) break;
-        name_arm(&plan->arms[methods[m].arm], name, sizeof name);
+        eval_name_arm(&plan->arms[methods[m].arm], methods[m].kind, name, sizeof name);
         add_method_columns(t, name);
     }
     for (int i = 0; i <= plan->scene_count && w->result == GSF_OK; i++) {
@@ -523,7 +524,7 @@ static eval_run like_reconstruction(const eval_plan* plan, int views, int init, 
 static void add_reconstruction_row(tables* w, table* t, int arm, int init) {
     const eval_plan* plan = w->plan;
     char name[TABLE_NAME];
-    name_arm(&plan->arms[arm], name, sizeof name);
+    eval_name_arm(&plan->arms[arm], EVAL_RECONSTRUCTION, name, sizeof name);
     table_row* row = add_row(w, t, name, start_of(plan, init));
     for (int s = 0; s < 3; s++)
         for (int k = 0; k < plan->view_counts; k++) {
@@ -614,16 +615,18 @@ static void write_introduction(tables* w) {
     for (int i = 0; i < plan->scene_count; i++) gsf_append_text(ctx, md, "%s%s", i ? ", " : "", plan->scenes[i]);
     gsf_append_text(ctx, md, "), %d seed%s from %llu.", seeds, seeds == 1 ? "" : "s", (unsigned long long)o->seed);
     if (seeds > 1) gsf_append_text(ctx, md, " Figures are means ± their standard errors over the seeds.");
-    gsf_append_text(ctx, md, " Arrows say whether more or less is better; the best of the rows measured here is bold. *Start* names "
-                             "the initial points; *tracks* are those that the papers use.\n\n"
-                             "Reconstruction: splats trained on K photos; every %s photo by name is held out and measured, per photo, "
-                             "then per scene.", o->test_every ? gsfix_pathf("%dth", o->test_every).s : "8th");
+    gsf_append_text(ctx, md,
+                    " Arrows say whether more or less is better; the best of the rows measured here is bold. *Start* names the "
+                    "initial points; *tracks* are those that the papers use.\n\nReconstruction: splats trained on K photos; every "
+                    "%s photo by name is held out and measured, per photo, then per scene.", o->test_every ? gsfix_pathf("%dth", o->test_every).s : "8th");
     if (plan->tables & (EVAL_TABLE_RESTORATION | EVAL_TABLE_CONDITIONS))
-        gsf_append_text(ctx, md, " Restoration: plain splats of %d photos, rendered along the capture; PSNR, SSIM and LPIPS over the "
-                                 "frames between these photos, the others over whole sequences.", plan->views[0]);
+        gsf_append_text(ctx, md,
+                        " Restoration: plain splats of %d photos, rendered along the capture; PSNR, SSIM and LPIPS over the frames "
+                        "between these photos, the others over whole sequences.", plan->views[0]);
     gsf_append_text(ctx, md, " SSIM and LPIPS (VGG, images in [0,1]) are computed as in the 3DGS papers.");
     if (o->benchmark)
-        gsf_append_text(ctx, md, " Rows named *paper* are printed figures; *paper, same scenes* are means of those printed per scene.");
+        gsf_append_text(ctx, md, " Rows named *paper* are printed figures; *paper, same scenes* are means of those printed per "
+                                 "scene.");
     if (plan->missing)
         gsf_append_text(ctx, md, "\n\n**%zu of %zu runs are missing**; means are over the scenes whose runs are there.",
                         plan->missing, plan->missing + plan->measured);
@@ -647,7 +650,8 @@ gsf_result eval_write_tables(gsfix_app* app, const eval_plan* plan) {
     for (int i = 0; i < 3; i++) {
         if (files[i]->failed) w.result = GSF_ERROR_OUT_OF_MEMORY;
         if (w.result == GSF_OK)
-            w.result = gsf_write_file(ctx, gsfix_pathf("%s/tables.%s", app->o.out, endings[i]).s, files[i]->data, files[i]->size);
+            w.result = gsf_write_file(ctx, gsfix_pathf("%s/tables.%s", app->o.out, endings[i]).s, files[i]->data,
+                                      files[i]->size);
         gsf_destroy_buffer(ctx, files[i]);
     }
     return w.result;
