@@ -16,16 +16,16 @@
 #endif
 
 /* Rank 0 lists the tasks, hands them out one by one, and merges their folders in the end, as `gsfix` alone does; the other
-   ranks work. A rank does not do its task itself: it starts `gsfix_mpi ... --task NAME` as a process of its own, which does not use
-   MPI, and meanwhile reports every second that it lives. So
+   ranks work. A rank does not do its task itself: it starts `gsfix_mpi ... --task NAME` as a process of its own, which does not
+   use MPI, and meanwhile reports every second that it lives. So
    - a task whose process crashes or is killed (by the kernel for lack of memory, say) is handed out again and continued from
      its checkpoint, at most SCHEDULE_TRIES times;
    - a rank that is killed takes its process along; rank 0 misses it after LOST_AFTER seconds (on its own machine within one)
-     and hands its task out again. mpirun must be told to carry on: --enable-recovery. Without workers rank 0 does the tasks itself.
-     Workers that miss rank 0 in the same way exit;
+     and hands its task out again. mpirun must be told to carry on: --enable-recovery. Without workers rank 0 does the tasks
+     itself. Workers that miss rank 0 in the same way exit;
    - a rank that was only slow does no harm: a task's folder is locked by the process at work in it, and the other one waits.
-   Results do not depend on who does a task, so that the output is that of one process, byte for byte. If rank 0 or mpirun dies,
-   the same command with --resume goes on. */
+   Results do not depend on who does a task, so that the output is that of one process, byte for byte. If rank 0 or mpirun
+   dies, the same command with --resume goes on. */
 enum { TAG_TO_WORKER = 1, TAG_TO_CHIEF = 2, TEXT_MOST = 400, BUSY_MOST = 600 };
 enum { ORDER_STOP = -1, ORDER_NONE = -2, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
 enum { START_MOST = 300, END_MOST = 10, MERGE_MOST = 3600 }; // seconds until all have started, for MPI to end, for merging

@@ -623,7 +623,8 @@ static void write_introduction(tables* w) {
         gsf_append_text(ctx, md,
                         " Restoration: plain splats of %d photos, rendered along the capture; PSNR, SSIM and LPIPS over the frames "
                         "between these photos, the others over whole sequences.", plan->views[0]);
-    gsf_append_text(ctx, md, " SSIM and LPIPS (VGG, images in [0,1]) are computed as in the 3DGS papers.");
+    gsf_append_text(ctx, md, " SSIM%s defined as in the 3DGS papers.",
+                    strstr(plan->which, "lpips") ? " and LPIPS (VGG, images in [0,1]) are" : " is");
     if (o->benchmark)
         gsf_append_text(ctx, md, " Rows named *paper* are printed figures; *paper, same scenes* are means of those printed per "
                                  "scene.");
