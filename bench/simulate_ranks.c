@@ -9,13 +9,13 @@
 #include <stdio.h>
 #include <time.h>
 
-/* Decisions are those of examples/gsfix_schedule.h; time is simulated. Tasks take --seconds on average (lognormal, sigma 0.6), a
-   sixth of them needs an earlier one, as in gsfix evaluate. Around each, its process takes --start seconds to begin and end.
+/* Decisions are those of examples/gsfix_schedule.h; time is simulated. Tasks take --seconds on average (lognormal), and one in
+   six needs an earlier one, as in gsfix evaluate. Around each, its process takes --start seconds to begin and end.
    Rank 0 handles one message after the other, each in --message seconds: reports, and the signs of life that every rank at
-   work sends once a second. Ranks are lost at random; each is missed after a minute, and comes back a minute later; what it
-   did on its task is lost (really its task goes on from a checkpoint). Prints the time until the last task has ended, beside that
-   with all ranks at work all the time; the share of rank 0's time that messages take; how long a rank waits on average from its
-   report to its next task; and the time that a decision really takes. */
+   work sends once a second. Ranks are lost at random, each is missed after a minute, and comes back a minute later; what it
+   did on its task is lost (really its task goes on from a checkpoint). Printed are the time until the last task has ended,
+   beside that with all ranks at work all the time, the share of rank 0's time that messages take, how long a rank waits on
+   average from its report to its next task, and the time that a decision really takes. */
 typedef struct options { double ranks, tasks, seconds, start, message, lost_per_hour, seed; } options;
 enum { EVENT_REPORT, EVENT_LOST, EVENT_MISSED, EVENT_BACK };
 typedef struct event { double time; int kind; size_t worker, task; uint64_t life; } event;
