@@ -310,6 +310,7 @@ static void eval_write_settings(eval_job* job) {
     gsfix_json_number(ctx, t, "test_every", o->test_every ? o->test_every : 8);
     gsfix_json_number(ctx, t, "factor", o->factor ? o->factor : 1);
     gsfix_json_number(ctx, t, "max_size", o->max_size);
+    gsfix_json_text(ctx, t, "photo_masks", o->photo_masks ? o->photo_masks : "on");
     gsfix_json_number(ctx, t, "frames", o->frames ? o->frames : 49);
     gsfix_json_text(ctx, t, "metrics", job->plan->which);
     if (!o->restorer || strncmp(o->restorer, "dit:", 4) != 0) return;
