@@ -644,8 +644,9 @@ gsf_result eval_write_tables(gsfix_app* app, const eval_plan* plan) {
     if (plan->tables & EVAL_TABLE_RECONSTRUCTION) write_reconstruction(&w);
     if (plan->tables & EVAL_TABLE_CONDITIONS) write_conditions(&w);
     if (plan->tables & EVAL_TABLE_TRAJECTORIES) write_trajectories(&w);
-    if (plan->tables & EVAL_TABLE_RESTORATION) write_restoration_scenes(&w);
-    if (plan->tables & EVAL_TABLE_RECONSTRUCTION) write_reconstruction_scenes(&w);
+    const int per_scene = plan->scene_count > 1 || plan->given.benchmark; // else they would repeat the others
+    if (per_scene && plan->tables & EVAL_TABLE_RESTORATION) write_restoration_scenes(&w);
+    if (per_scene && plan->tables & EVAL_TABLE_RECONSTRUCTION) write_reconstruction_scenes(&w);
     gsf_buffer* const files[] = {&w.md, &w.tex, &w.csv};
     static const char* const endings[] = {"md", "tex", "csv"};
     for (int i = 0; i < 3; i++) {
