@@ -26,25 +26,45 @@ typedef struct option_spec {
 } option_spec;
 
 #define AT(field) offsetof(gsfix_options, field)
-#define ALL "info fix render filter path restore metrics masks dataset"
+#define ALL "info fix render filter path restore metrics masks dataset evaluate"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset",
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset evaluate",
      "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
     {"--views", TEXT, AT(views), 0, 0, "3,6,9", "dataset",
      "numbers of reference views, each with splats and sequences of its own (default 3)"},
-    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
+    {"--views", TEXT, AT(views), 0, 0, "3,6,9", "evaluate",
+     "numbers of training views (default 3,6,9); restorers and trajectories are compared with the first of them"},
+    {"--restorers", TEXT, AT(restorers), 0, 0, "LIST", "evaluate",
+     "what is compared, separated by commas (default plain,none,warp): plain, 3DGS without regularisers; none, with\n"
+     "regularisers for few views; warp, dit:MODEL_DIR and exec:COMMAND, these and a restorer as for gsfix fix"},
+    {"--trajectories", TEXT, AT(trajectories), 0, 0, "LIST", "evaluate",
+     "camera paths of the frames to repair, of reference, ellipse, interpolate (default reference); several give the\n"
+     "table that compares them"},
+    {"--inits", TEXT, AT(inits), 0, 0, "LIST", "evaluate",
+     "initial points, of tracks, default, embree, both, all, dense, random (default tracks, as in the paper; default is\n"
+     "what gsfix fix does without --init)"},
+    {"--conditions", TEXT, AT(conditions), 0, 0, "LIST", "evaluate",
+     "dit: features of the photos that guide it, of none, 2d, 3d, both (default both); several give the table that\n"
+     "compares them"},
+    {"--seeds", INT, AT(seeds), 1, 1000, "N", "evaluate",
+     "run everything N times, from --seed on; tables have the mean and its standard error (default 1)"},
+    {"--tables", TEXT, AT(tables), 0, 0, "LIST", "evaluate",
+     "which tables to make, of restoration, reconstruction, conditions, trajectories (default: all that the lists allow)"},
+    {"--benchmark", TEXT, AT(benchmark), 0, 0, "dl3dv|mipnerf360", "evaluate",
+     "the scenes are those of this data set, by the names of their folders: the paper's printed figures stand beside ours"},
+    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info evaluate",
      "hold out every Nth view by name (default 8)"},
-    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset",
+    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
-    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset",
+    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset evaluate",
      "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
      "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
      "diffusion model; exec is a program of yours, run as COMMAND JOBDIR"},
-    {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
+    {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore evaluate",
      "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
      "dit: features of the photos that guide the model: 2d (semantic), 3d (geometric), both (default) or none"},
@@ -54,27 +74,28 @@ static const option_spec option_specs[] = {
      "tensors are computed by the model's encoders"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
      "dit: save the encoded photos and the prompts of all clips to a new file, for --ref-features"},
-    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
+    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore evaluate",
      "dit: the prompt, a description of the scene (default: the model captions the first frame of each clip)"},
-    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: denoising steps (default 50; with --quality fast 10)"},
-    {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
+    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore evaluate",
+     "dit: denoising steps (default 50; with --quality fast 10)"},
+    {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore evaluate",
      "dit: solver of the denoising steps (default ddim, as published; with --quality fast unipc)"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "dataset", "what captions.json and the manifests say (default: empty)"},
-    {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore",
+    {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore evaluate",
      "dit: scale of classifier-free guidance (default 6; 1 skips the unconditional pass and halves the work)"},
-    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore",
+    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore evaluate",
      "dit: use guidance only in the first FRACTION of the steps (default 1)"},
-    {"--strength", REAL, AT(strength), 0.001, 1, "FRACTION", "fix restore",
+    {"--strength", REAL, AT(strength), 0.001, 1, "FRACTION", "fix restore evaluate",
      "dit: start from the noised frames and run only the last FRACTION of the steps (default 1: from pure noise)"},
-    {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore",
+    {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore evaluate",
      "dit: if the output of the first block changes by less than this (e.g. 0.1) from one step to the next, reuse the\n"
      "last output of all other blocks (default 0: never)"},
-    {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore",
+    {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore evaluate",
      "dit: quantize most layers of the transformer to 8-bit integers; needs one byte of memory per weight"},
-    {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore",
+    {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore evaluate",
      "dit: matrix products of the transformer in bfloat16 if the processor supports it (AVX512_BF16); implied by\n"
      "--quality fast"},
-    {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore",
+    {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore evaluate",
      "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"
      "has never seen, then replace its learned positions"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
@@ -87,7 +108,7 @@ static const option_spec option_specs[] = {
      "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate|spread", "fix",
      "camera path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix evaluate", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
      "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
      "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
@@ -100,35 +121,36 @@ static const option_spec option_specs[] = {
     {"--compare", FLAG, AT(compare), 0, 0, NULL, "fix",
      "also train the same number of steps from the same start and seed without repair, and report both runs: the\n"
      "difference is what the repair alone contributes"},
-    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix dataset",
+    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix dataset evaluate",
      "approximations that are allowed (default balanced; exact allows none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png for each held-out view: the \"seen\" figures are measured over the white pixels (see gsfix masks)"},
-    {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix",
+    {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix evaluate",
      "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
      "on nor measured, grey ones count partially (default on)"},
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
      "background colour: black (default), white, R,G,B from 0 to 1, or (fix) random, a new one in each step"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
-    {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset", "go on with what an interrupted run has left in OUT"},
+    {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset evaluate", "go on with what an interrupted run has left in OUT"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",
      "start over even if OUT contains a checkpoint, which is then deleted"},
-    {"--restart", FLAG, AT(restart), 0, 0, NULL, "dataset", "begin anew even if OUT contains a run's results or checkpoints"},
-    {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset",
-     "only print the names of the tasks, one per scene, that gsfix_mpi distributes"},
-    {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset", "only do this task"},
+    {"--restart", FLAG, AT(restart), 0, 0, NULL, "dataset evaluate",
+     "begin anew even if OUT contains a run's results or checkpoints"},
+    {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset evaluate",
+     "only print the names of the tasks (dataset: one per scene, evaluate: one per run), which gsfix_mpi distributes"},
+    {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset evaluate", "only do this task"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times per run and after every\n"
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
-    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset",
-     "write OUT/SCENE/checkpoint every N training steps (default: once a minute)"},
+    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
+     "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
     {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
      "also write OUT/splats.splat (no view-dependent colour) or OUT/splats.spz"},
-    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset",
+    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset evaluate",
      "override individual settings of the trainer and of the repair loop:"},
-    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset",
+    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset evaluate",
      "frames per sequence, both references included: longer captures are thinned out evenly (default 49); the captures of\n"
      "fewer photos are used as they are"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
@@ -150,8 +172,12 @@ static const option_spec option_specs[] = {
      "lpips_squeeze on images in [-1,1], lpips_alex_raw ... on images in [0,1]. DIR_A as a clip: temporal_flickering; with\n"
      "--models motion_smoothness, overall_consistency (with --prompt), and against the first picture of DIR_B i2v_subject,\n"
      "i2v_background (default psnr,ssim_3dgs)"},
+    {"--which", TEXT, AT(which), 0, 0, "NAME,...", "evaluate",
+     "metrics of the tables besides PSNR and SSIM: lpips_vgg_raw (as published figures), and of restored sequences\n"
+     "temporal_flickering, i2v_subject, i2v_background, motion_smoothness, overall_consistency (the last with --caption;\n"
+     "default: all for which --models and --caption are given)"},
     {"--prompt", TEXT, AT(prompt), 0, 0, "TEXT", "metrics", "what DIR_A shows, for overall_consistency"},
-    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
+    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics evaluate", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
      "number of workers (default: all cores); results are bit-identical for any number"},
@@ -190,7 +216,8 @@ static const command_spec command_specs[] = {
      1, run_masks},
     {"dataset", "SCENE... --out DIR", "write paired sequences of artifact and clean frames, to train and judge restorers", -1,
      gsfix_run_dataset},
-    {"evaluate", "", "", 0, NULL}, // reserved: refused with "not in this version"
+    {"evaluate", "SCENE... --out DIR", "make the paper's tables and a gallery: restorers, trajectories and starts compared", -1,
+     gsfix_run_evaluate},
 };
 enum { COMMAND_COUNT = sizeof command_specs / sizeof command_specs[0] };
 
@@ -316,7 +343,7 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
     if (app->o.help) return 0;
     if (command->inputs < 0 ? app->o.input_count < -command->inputs : app->o.input_count != command->inputs)
         return gsfix_misused(app, "expected: gsfix %s %s", command->name, command->usage);
-    if (has_word("fix render filter path restore masks dataset", command->name) && !app->o.out)
+    if (has_word("fix render filter path restore masks dataset evaluate", command->name) && !app->o.out)
         return gsfix_misused(app, "--out is missing");
     if (app->o.factor && app->o.max_size) return gsfix_misused(app, "--factor and --max-size exclude each other");
     if (app->o.resume && app->o.restart) return gsfix_misused(app, "--resume and --restart exclude each other");
@@ -1000,14 +1027,14 @@ static gsf_result measure(gsf_context* ctx, metric_run* run, int m, const gsf_im
 }
 
 // Opens the networks of the wanted metrics, so that a missing file is reported before any work.
-static gsf_result open_networks(gsfix_app* app, metric_run* run) {
+static gsf_result open_networks(gsfix_app* app, metric_run* run, const char* prompt) {
     gsf_result result = GSF_OK;
     for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
         if (!run->wanted[m] || metric_specs[m].net < 0) continue;
         run->nets[m].kind = (gsf_nn_metric_kind)metric_specs[m].net;
         run->nets[m].raw = metric_specs[m].raw;
         run->nets[m].models = app->o.models;
-        run->nets[m].prompt = app->o.prompt;
+        run->nets[m].prompt = prompt;
         result = gsf_nn_measure_frame(&app->ctx, &run->nets[m], NULL, NULL);
     }
     return result;
@@ -1148,7 +1175,7 @@ static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
     gsfix_names left = {0}, right = {0};
     metric_sums total = {0};
     int by_pair = 0;
-    gsf_result result = open_networks(app, run);
+    gsf_result result = open_networks(app, run, app->o.prompt);
     for (int m = 0; m < METRIC_COUNT; m++) by_pair |= measures_pair(run, m, 0);
     if (result == GSF_OK) result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
     if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
@@ -1200,6 +1227,61 @@ static int run_metrics(gsfix_app* app) {
     if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
     if (app->o.prompt && !prompts) return gsfix_misused(app, "--prompt: no metric of --which needs it");
     return compare_folders(app, &run) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+struct gsfix_meter {
+    metric_run run;
+    gsf_image before; // the last frame of the clip
+    double sums[METRIC_COUNT];
+    size_t pairs;
+};
+
+gsf_result gsfix_make_meter(gsfix_app* app, const char* which, const char* prompt, size_t frames, gsfix_meter** out) {
+    *out = (gsfix_meter*)gsf_alloc_zeroed(&app->ctx, 1, sizeof **out);
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    for (const char* p = which; *p; p += strspn(p, ",")) {
+        const size_t n = strcspn(p, ",");
+        for (int m = 0; m < METRIC_COUNT; m++)
+            if (strlen(metric_specs[m].name) == n && strncmp(metric_specs[m].name, p, n) == 0) (*out)->run.wanted[m] = 1;
+        p += n;
+    }
+    for (int m = 0; m < METRIC_COUNT; m++) (*out)->run.nets[m].frames = (int64_t)frames;
+    return open_networks(app, &(*out)->run, prompt);
+}
+
+gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
+                             const gsf_image* input) {
+    gsf_result result = GSF_OK;
+    for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
+        double value = 0.0;
+        if (!meter->run.wanted[m]) continue;
+        if (metric_specs[m].clip && input) result = measure_frame(&app->ctx, &meter->run, m, &meter->before, frame, input);
+        if (metric_specs[m].clip || !truth) continue;
+        result = measure(&app->ctx, &meter->run, m, frame, truth, NULL, &value);
+        meter->sums[m] += value;
+    }
+    if (result == GSF_OK && truth) meter->pairs++;
+    if (result == GSF_OK && input) { // the frame is borrowed
+        gsf_destroy_image(&app->ctx, &meter->before);
+        result = gsf_make_image(&app->ctx, frame->dtype, frame->width, frame->height, frame->channels, &meter->before);
+        if (result == GSF_OK) result = gsf_convert_image(&app->ctx, frame, &meter->before);
+    }
+    return result;
+}
+
+double gsfix_read_meter(const gsfix_meter* meter, const char* name) {
+    for (int m = 0; m < METRIC_COUNT; m++) {
+        if (strcmp(metric_specs[m].name, name) != 0 || !meter->run.wanted[m]) continue;
+        if (metric_specs[m].clip) return meter->run.nets[m].count ? meter->run.nets[m].score : NAN;
+        return meter->sums[m] / (double)meter->pairs; // of none: NaN
+    }
+    return NAN;
+}
+
+void gsfix_destroy_meter(gsfix_app* app, gsfix_meter* meter) {
+    for (int m = 0; meter && m < METRIC_COUNT; m++) gsf_nn_destroy_metric(&app->ctx, &meter->run.nets[m]);
+    if (meter) gsf_destroy_image(&app->ctx, &meter->before);
+    gsf_free(&app->ctx, meter);
 }
 
 // ---- masks -----------------------------------------------------------------------
@@ -1270,17 +1352,7 @@ static int run_masks(gsfix_app* app) {
        frames/NAME.png  depth/NAME.npy  cameras.json
        refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy  refs/render/NAME.png
    exec needs only the frames; warp needs all of it (without refs/render it reprojects the photos themselves). */
-typedef struct clip {
-    gsfix_names frame_names, ref_names;
-    size_t frames, refs;
-    gsf_image *color, *depth, *alpha, *out_color, *out_confidence;
-    gsf_camera *cameras, *ref_cameras;
-    size_t camera_count, ref_camera_count;
-    int32_t* reference_index;
-    gsf_reference* references;
-} clip;
-
-static gsf_result load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
+gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
     gsf_image bytes;
     memset(out, 0, sizeof *out);
     gsf_result result = gsf_load_image(ctx, path, channels, &bytes);
@@ -1291,7 +1363,20 @@ static gsf_result load_float(gsf_context* ctx, const char* path, int32_t channel
     return result;
 }
 
-static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
+gsf_result gsfix_make_clip(gsf_context* ctx, size_t frames, gsfix_clip* c) {
+    c->color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * frames, sizeof *c->color);
+    c->reference_index = (int32_t*)gsf_alloc(ctx, frames, sizeof *c->reference_index);
+    if (!c->color || !c->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
+    c->frames = frames;
+    c->depth = c->color + frames;
+    c->alpha = c->depth + frames;
+    c->out_color = c->alpha + frames;
+    c->out_confidence = c->out_color + frames;
+    for (size_t i = 0; i < frames; i++) c->reference_index[i] = -1;
+    return GSF_OK;
+}
+
+static gsf_result load_clip_frames(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     const char* folder = app->o.inputs[0];
     const gsfix_path inner = gsfix_pathf("%s/frames", folder);
@@ -1302,22 +1387,14 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     if (result != GSF_OK) return result;
     const size_t n = c->frame_names.count;
     if (n == 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no pictures there", at);
-    c->color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * n, sizeof *c->color);
-    c->reference_index = (int32_t*)gsf_alloc(ctx, n, sizeof *c->reference_index);
-    if (!c->color || !c->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
-    c->frames = n;
-    c->depth = c->color + n;
-    c->alpha = c->depth + n;
-    c->out_color = c->alpha + n;
-    c->out_confidence = c->out_color + n;
+    if ((result = gsfix_make_clip(ctx, n, c)) != GSF_OK) return result;
     for (size_t i = 0; i < n && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_stem(c->frame_names.names[i]);
-        c->reference_index[i] = -1;
         for (size_t k = 0; k < i; k++) // a.jpg and a.png would share one output name
             if (strcmp(gsfix_stem(c->frame_names.names[k]).s, stem.s) == 0)
                 return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %s and %s differ in nothing but their ending", at,
                                 c->frame_names.names[k], c->frame_names.names[i]);
-        result = load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
+        result = gsfix_load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
         const int64_t width = c->color[i].width, height = c->color[i].height;
         if (result == GSF_OK && (width != c->color[0].width || height != c->color[0].height))
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/%s: %lld x %lld, but the first frame is %lld x %lld", at,
@@ -1328,7 +1405,7 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
         if (result == GSF_OK && depth && (c->depth[i].width != width || c->depth[i].height != height))
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/depth/%s.npy: not of the frame's size", folder, stem.s);
         if (result == GSF_OK && alpha)
-            result = load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
+            result = gsfix_load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 3, c->out_color + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 1, c->out_confidence + i);
     }
@@ -1344,7 +1421,7 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     return result;
 }
 
-static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
+static gsf_result load_clip_refs(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     const gsfix_path folder = gsfix_pathf("%s/refs", app->o.inputs[0]);
     gsf_result result = GSF_OK;
@@ -1369,17 +1446,17 @@ static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
         gsf_reference* r = c->references + i;
         const char* name = c->ref_names.names[i];
         c->refs = i + 1;
-        result = load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
+        result = gsfix_load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
         if (result == GSF_OK && c->ref_camera_count == c->ref_names.count) r->camera = c->ref_cameras[i];
         const gsfix_path render = gsfix_pathf("%s/render/%s.png", folder.s, gsfix_stem(name).s);
         const gsfix_path depth = gsfix_pathf("%s/depth/%s.npy", folder.s, gsfix_stem(name).s);
-        if (result == GSF_OK && gsfix_exists(render.s)) result = load_float(ctx, render.s, 3, &r->render);
+        if (result == GSF_OK && gsfix_exists(render.s)) result = gsfix_load_float(ctx, render.s, 3, &r->render);
         if (result == GSF_OK && gsfix_exists(depth.s)) result = gsfix_load_npy(ctx, depth.s, &r->depth);
     }
     return result;
 }
 
-static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // requirements of the warp restorer
+static gsf_result check_warp_clip(gsfix_app* app, const gsfix_clip* c) { // requirements of the warp restorer
     const char* folder = app->o.inputs[0];
     const char* lacks = !c->cameras                       ? "cameras.json (where the frames are)"
                         : !c->depth                       ? "depth/NAME.npy of each frame"
@@ -1392,7 +1469,7 @@ static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // requiremen
     return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s: the restorer warp needs %s", folder, lacks);
 }
 
-static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) {
+gsf_result gsfix_restore_clip(gsfix_app* app, gsfix_clip* c, gsf_restorer* restorer) {
     gsf_context* ctx = &app->ctx;
     gsf_restore_window window = {0};
     window.struct_size = sizeof window;
@@ -1412,7 +1489,7 @@ static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) 
     return result;
 }
 
-static void free_clip(gsfix_app* app, clip* c) {
+void gsfix_free_clip(gsfix_app* app, gsfix_clip* c) {
     gsf_context* ctx = &app->ctx;
     for (size_t i = 0; i < 5 * c->frames; i++) gsf_destroy_image(ctx, c->color + i);
     for (size_t i = 0; i < c->refs; i++) {
@@ -1429,7 +1506,7 @@ static void free_clip(gsfix_app* app, clip* c) {
     gsfix_free_names(ctx, &c->ref_names);
 }
 
-static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
+static gsf_result open_restore_out(gsfix_app* app, const gsfix_clip* c) {
     gsf_result result = gsfix_claim(app, "dit.checkpoint");
     if (result == GSF_OK) result = gsfix_claim(app, "dit.checkpoint.*");
     for (size_t i = 0; i < c->frames && result == GSF_OK; i++) {
@@ -1444,7 +1521,7 @@ static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
 
 static gsf_result restore_folder(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
-    clip c = {0};
+    gsfix_clip c = {0};
     gsf_restorer restorer = {0};
     int present = 0;
     const double begin = gsfix_now();
@@ -1453,7 +1530,7 @@ static gsf_result restore_folder(gsfix_app* app) {
     if (result == GSF_OK && strcmp(app->o.restorer, "warp") == 0) result = check_warp_clip(app, &c);
     if (result == GSF_OK) result = open_restore_out(app, &c);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &restorer, &present);
-    if (result == GSF_OK && present) result = restore_clip(app, &c, &restorer);
+    if (result == GSF_OK && present) result = gsfix_restore_clip(app, &c, &restorer);
     for (size_t i = 0; i < c.frames && result == GSF_OK; i++) {
         const gsfix_path name = gsfix_stem(c.frame_names.names[i]);
         result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name.s).s,
@@ -1473,7 +1550,7 @@ static gsf_result restore_folder(gsfix_app* app) {
         gsfix_print_stages(app);
     }
     gsfix_destroy_restorer(app, &restorer);
-    free_clip(app, &c);
+    gsfix_free_clip(app, &c);
     return result;
 }
 
@@ -1554,7 +1631,7 @@ static int run_command(gsfix_app* app, const command_spec* command, int argc, ch
     return code;
 }
 
-int main(int argc, char** argv) {
+int gsfix_start(int argc, char** argv, const struct gsfix_crew* crew) {
     static gsfix_app app;
     memset(&app, 0, sizeof app); // tests call this more than once
     if (argc < 2) return print_overview(stderr);
@@ -1570,6 +1647,7 @@ int main(int argc, char** argv) {
     app.started = gsfix_now();
     app.terminal = isatty(2) && getenv("TERM") && strcmp(getenv("TERM"), "dumb") != 0;
     app.line_share = -1;
+    app.crew = crew;
     app.o.inputs = (const char**)calloc((size_t)argc, sizeof(char*));
     if (!app.o.inputs) return fputs("gsfix: out of memory\n", stderr), 1;
     int code = parse_options(&app, command, argc, argv);
@@ -1579,12 +1657,17 @@ int main(int argc, char** argv) {
     return code;
 }
 
+int main(int argc, char** argv) { return gsfix_start(argc, argv, NULL); }
+
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
 #include "gsfix_dataset.c"
+#include "gsfix_evaluate.c"
 #include "gsfix_exec.c"
 #include "gsfix_fix.c"
+#include "gsfix_gallery.c"
 #include "gsfix_out.c"
 #include "gsfix_report.c"
+#include "gsfix_tables.c"
 #include "gsfix_tasks.c"
 #include "gsfix_util.c"
 #endif

@@ -18,9 +18,10 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
+    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
-    int clean_iterations;
+    int clean_iterations, seeds;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
     const char** inputs;
@@ -50,6 +51,7 @@ typedef struct gsfix_app {
     int line_share;     // tenth of the work that the last plain progress line reported
     double clip_line;   // gsfix_now() of the last progress line of the current clip
     double stage_begin; // gsfix_now() at the start of the restorer's current unit of work
+    const struct gsfix_crew* crew; // does the tasks of gsfix_run_tasks; NULL: this process, one after the other
     gsfix_clip_stage stages[GSFIX_CLIP_STAGES];
     int stage_count;
 } gsfix_app;
@@ -151,6 +153,8 @@ void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- gsfix.c: shared by several commands ------------------------------------------
 
+int gsfix_start(int argc, char** argv, const struct gsfix_crew* crew); // the program; main without a crew
+
 typedef struct gsfix_split { uint32_t *train, *test; size_t train_count, test_count; } gsfix_split;
 
 gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out);
@@ -169,6 +173,30 @@ extern const char* const gsfix_solvers[3];    // names of gsf_nn_solver for --so
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app); // from the options, for --restorer dit:MODEL_DIR
 gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app); // removes the last clip's checkpoint when the run is complete
 gsf_traj_kind gsfix_path_kind(const char* name);
+
+typedef struct gsfix_clip { // frames, photos and what a restorer makes of them
+    gsfix_names frame_names, ref_names;
+    size_t frames, refs;
+    gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // per frame; depth, alpha: or NULL
+    gsf_camera *cameras, *ref_cameras;
+    size_t camera_count, ref_camera_count;
+    int32_t* reference_index;
+    gsf_reference* references;
+} gsfix_clip;
+gsf_result gsfix_make_clip(gsf_context* ctx, size_t frames, gsfix_clip* c); // fills in the lists of frames of a zeroed clip
+gsf_result gsfix_restore_clip(gsfix_app* app, gsfix_clip* c, gsf_restorer* restorer);
+void gsfix_free_clip(gsfix_app* app, gsfix_clip* c);
+gsf_result gsfix_load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out); // as f32
+
+typedef struct gsfix_meter gsfix_meter; // mean values of metrics over pairs of images, and values of a clip
+// which: names of metrics in this version, separated by commas. Opens their networks in --models. prompt: for
+// overall_consistency; frames: of the clip. To be destroyed after errors, too.
+gsf_result gsfix_make_meter(gsfix_app* app, const char* which, const char* prompt, size_t frames, gsfix_meter** out);
+// truth NULL: the frame does not count for metrics of pairs; input: of the metrics of clips, NULL: the frame is not in a clip.
+gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image* frame, const gsf_image* truth,
+                             const gsf_image* input);
+double gsfix_read_meter(const gsfix_meter* meter, const char* name); // NaN: not measured
+void gsfix_destroy_meter(gsfix_app* app, gsfix_meter* meter);
 
 // ---- gsfix_tasks.c: commands whose work is a list of tasks ------------------------
 /* A task has a folder of its own, OUT/NAME, with its own manifest and lock, and writes nothing else. What it writes depends
@@ -190,8 +218,25 @@ typedef struct gsfix_tasks {
     gsf_result (*run_fn)(gsfix_app* app, void* user, size_t task);
     // o.out is OUT, claimed and open. All tasks are done.
     gsf_result (*merge_fn)(gsfix_app* app, void* user);
+    const size_t* needs; // per task an earlier one that has to be done first, or its own index; NULL: no task needs another
+    int merges_partly;   // merge_fn is called although tasks have failed, and says what is missing
 } gsfix_tasks;
 int gsfix_run_tasks(gsfix_app* app, const gsfix_tasks* tasks); // returns an exit code
+
+typedef struct gsfix_tally { // what became of the tasks so far
+    const gsfix_tasks* tasks;
+    uint8_t* done; // per task
+    size_t failed;
+    gsf_result why;      // of the first failure
+    char first[400];     // its text
+} gsfix_tally;
+// A task has ended. `text`: why it failed, not read otherwise.
+void gsfix_note_task(gsfix_app* app, gsfix_tally* tally, size_t task, gsf_result result, const char* text);
+// Does all tasks, in an order that respects `needs`, and notes each; returns GSF_OK unless it was cancelled or cannot go on.
+typedef struct gsfix_crew {
+    gsf_result (*run_fn)(gsfix_app* app, void* user, gsfix_tally* tally);
+    void* user;
+} gsfix_crew;
 // Names for tasks from the paths of scenes: their last parts, with the part before where those are equal.
 gsf_result gsfix_name_scenes(gsfix_app* app, char*** names); // one per input; freed by gsfix_free_names
 // ---- gsfix_fix.c, gsfix_report.c -------------------------------------------------
@@ -250,12 +295,39 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
     const gsfix_score* views; // one per test view
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;
+    gsf_render_desc render;   // what the splats were trained with, the near plane included
     int32_t iterations;
 } gsfix_result;
 
 gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result);
 
 int gsfix_run_fix(gsfix_app* app);
+
+// A run of fix inside another command: it writes OUT/checkpoint, which stays, OUT/test/*.png, and what finish_fn writes.
+typedef struct gsfix_fix_task {
+    gsf_result (*claim_fn)(gsfix_app* app, void* user);                               // claims what finish_fn writes
+    gsf_result (*finish_fn)(gsfix_app* app, const gsfix_result* result, void* user);
+    void* user;
+} gsfix_fix_task;
+gsf_result gsfix_fix_scene(gsfix_app* app, const gsfix_setup* setup, const gsfix_fix_task* task); // task NULL: gsfix fix
+
+// ---- pages: parts of report.html that other pages share (gsfix_report.c) -------------
+
+typedef struct gsfix_page {
+    gsf_context* ctx;
+    const gsfix_result* r; // what report.html is about; other pages: NULL
+    gsf_buffer html;
+} gsfix_page;
+
+void gsfix_put(gsfix_page* p, const char* format, ...) GSF_PRINTF(2, 3); // up to 4095 bytes
+void gsfix_put_raw(gsfix_page* p, const char* text);
+void gsfix_put_escaped(gsfix_page* p, const char* text);
+void gsfix_put_lines(gsfix_page* p, const char* const* lines);     // until NULL
+// A JPEG in base64, at most `side` pixels wide and high; *width and *height (or NULL) get its size.
+gsf_result gsfix_put_jpeg(gsfix_page* p, const gsf_image* image, int64_t side, int64_t* width, int64_t* height);
+void gsfix_put_head(gsfix_page* p, const char* title); // up to <body>, with the common style
+void gsfix_put_legend(gsfix_page* p);                  // colour scale of the error maps
+extern const double gsfix_error_white;                 // mean absolute error at the bright end of the error maps
 
 // ---- gsfix_dataset.c ---------------------------------------------------------------
 
@@ -296,8 +368,24 @@ gsf_result gsfix_parse_scene_manifest(gsf_context* ctx, const char* name, const 
 void gsfix_free_scene_manifest(gsf_context* ctx, gsfix_scene_manifest* manifest);
 
 int gsfix_run_dataset(gsfix_app* app);
+
+// A scene of the dataset inside another command, which sets the options before.
+typedef struct gsfix_dataset_plan gsfix_dataset_plan;
+int gsfix_make_dataset_plan(gsfix_app* app, gsfix_dataset_plan** out); // from the options; 0 or an exit code
+void gsfix_destroy_dataset_plan(gsfix_app* app, gsfix_dataset_plan* plan);
+// Writes the scene's folder into o.out, which it claims and opens.
+gsf_result gsfix_make_dataset_scene(gsfix_app* app, const gsfix_dataset_plan* plan, const char* name, const char* path);
+int gsfix_has_dataset_scene(gsfix_app* app, const gsfix_dataset_plan* plan); // is o.out complete and made with these settings?
+gsf_result gsfix_load_sequence(gsf_context* ctx, gsfix_path path, gsfix_sequence* out);
+gsf_result gsfix_load_scene_manifest(gsf_context* ctx, const char* path, gsfix_scene_manifest* out);
+// Parses numbers of views of at least 2, separated by commas; 0 or an exit code.
+int gsfix_parse_views(gsfix_app* app, const char* text, int views[16], int* count);
 int gsfix_is_manifest(const char* path); // does the file begin as a manifest of this command does?
 // For `gsfix info`: the manifest of a sequence or of a scene; checks the digests of all its files.
 gsf_result gsfix_info_dataset(gsfix_app* app, const char* path);
+
+// ---- gsfix_evaluate.c ----------------------------------------------------------------
+
+int gsfix_run_evaluate(gsfix_app* app);
 
 #endif

@@ -37,7 +37,7 @@ static const struct { const char *name, *folder; double strength; } kinds[KIND_C
 
 enum { MAX_VIEW_COUNTS = 16, BATCH = 8, STREAM_PERTURB = 0x70657274 };
 
-typedef struct dataset_plan { // for all scenes
+struct gsfix_dataset_plan { // for all scenes
     int kinds;                  // bits of KIND_...
     int views[MAX_VIEW_COUNTS]; // values of K
     int view_counts, frames;
@@ -45,7 +45,8 @@ typedef struct dataset_plan { // for all scenes
     gsfix_setup sparse, clean;
     gsf_buffer settings;        // JSON object without the closing brace: what determines the result, apart from the scene
     char** names;
-} dataset_plan;
+};
+typedef struct gsfix_dataset_plan dataset_plan;
 
 static int parse_kinds(gsfix_app* app, dataset_plan* plan) {
     const char* text = app->o.kinds ? app->o.kinds : "sparse";
@@ -61,18 +62,18 @@ static int parse_kinds(gsfix_app* app, dataset_plan* plan) {
     }
 }
 
-static int parse_views(gsfix_app* app, dataset_plan* plan) {
-    const char* text = app->o.views ? app->o.views : "3";
+int gsfix_parse_views(gsfix_app* app, const char* text, int views[MAX_VIEW_COUNTS], int* count) {
+    *count = 0;
     for (const char* p = text;; p++) {
         char* end;
         const long k = strtol(p, &end, 10);
         int again = 0;
         if (end == p || (*end && *end != ',') || k < 2 || k > 1000)
             return gsfix_misused(app, "--views %s: expected numbers of at least 2, separated by commas", text);
-        for (int i = 0; i < plan->view_counts; i++) again |= plan->views[i] == k;
-        if (again || plan->view_counts == MAX_VIEW_COUNTS)
+        for (int i = 0; i < *count; i++) again |= views[i] == k;
+        if (again || *count == MAX_VIEW_COUNTS)
             return gsfix_misused(app, "--views %s: %s", text, again ? "a number stands there twice" : "too many");
-        plan->views[plan->view_counts++] = (int)k;
+        views[(*count)++] = (int)k;
         p = end;
         if (!*p) return 0;
     }
@@ -107,7 +108,7 @@ static void write_settings(gsfix_app* app, dataset_plan* plan) {
 
 static int resolve_plan(gsfix_app* app, dataset_plan* plan) { // 0 or an exit code
     int code = parse_kinds(app, plan);
-    if (!code) code = parse_views(app, plan);
+    if (!code) code = gsfix_parse_views(app, app->o.views ? app->o.views : "3", plan->views, &plan->view_counts);
     if (code) return code;
     plan->frames = app->o.frames ? app->o.frames : 49;
     plan->caption = app->o.caption ? app->o.caption : "";
@@ -620,7 +621,7 @@ static gsf_result render_sequence(scene_run* run, const gsf_splats* splats, int 
     return result;
 }
 
-static gsf_result load_sequence(gsf_context* ctx, gsfix_path path, gsfix_sequence* out) {
+gsf_result gsfix_load_sequence(gsf_context* ctx, gsfix_path path, gsfix_sequence* out) {
     void* data = NULL;
     size_t size = 0;
     memset(out, 0, sizeof *out);
@@ -636,7 +637,7 @@ static int is_finished(scene_run* run, int kind, int k, size_t s) {
     gsfix_sequence sequence = {0};
     if (!run->resuming || !gsfix_has_output(run->app, name.s)) return 0;
     int finished = gsfix_has_output(run->app, sequence_file(run, kind, k, s, "_cameras").s) &&
-                   load_sequence(run->ctx, at_out(run, name), &sequence) == GSF_OK;
+                   gsfix_load_sequence(run->ctx, at_out(run, name), &sequence) == GSF_OK;
     for (size_t i = 0; finished && i < sequence.frame_count; i++)
         for (int f = 0; f < GSFIX_FRAME_FILES && finished; f++) {
             uint64_t size, digest;
@@ -816,7 +817,7 @@ void gsfix_free_scene_manifest(gsf_context* ctx, gsfix_scene_manifest* manifest)
     memset(manifest, 0, sizeof *manifest);
 }
 
-static gsf_result load_scene_manifest(gsf_context* ctx, const char* path, gsfix_scene_manifest* out) {
+gsf_result gsfix_load_scene_manifest(gsf_context* ctx, const char* path, gsfix_scene_manifest* out) {
     void* data = NULL;
     size_t size = 0;
     memset(out, 0, sizeof *out);
@@ -835,7 +836,7 @@ static gsf_result add_sequence(scene_run* run, gsf_buffer* t, gsfix_path name, d
     gsfix_sequence sequence;
     uint64_t size, digest;
     double sum = 0.0, count = 0.0;
-    gsf_result result = load_sequence(ctx, at_out(run, name), &sequence); // reads back what was written
+    gsf_result result = gsfix_load_sequence(ctx, at_out(run, name), &sequence); // reads back what was written
     if (result != GSF_OK) return result;
     for (size_t i = 0; i < sequence.frame_count; i++)
         if (!sequence.frames[i].reference) sum += sequence.frames[i].psnr, count += 1.0;
@@ -909,18 +910,18 @@ static void free_scene_run(scene_run* run) {
     gsf_splat_destroy_scene(ctx, &run->scene);
 }
 
-static gsf_result run_scene(gsfix_app* app, void* user, size_t task) {
+gsf_result gsfix_make_dataset_scene(gsfix_app* app, const dataset_plan* plan, const char* name, const char* path) {
     static const scene_run zero;
     scene_run run = zero;
     dataset_sums sums = {0, 0, 0.0};
     const double begin = gsfix_now();
     run.app = app;
     run.ctx = &app->ctx;
-    run.plan = (const dataset_plan*)user;
-    run.name = run.plan->names[task];
+    run.plan = plan;
+    run.name = name;
     const int sparse = run.plan->kinds & 1, others = (run.plan->kinds & ~1) != 0;
     run.model_count = (sparse ? run.plan->view_counts : 0) + others;
-    gsf_result result = prepare_scene(&run, app->o.inputs[task]);
+    gsf_result result = prepare_scene(&run, path);
     if (result == GSF_OK) result = write_photos(&run);
     for (int k = 0; sparse && k < run.plan->view_counts && result == GSF_OK; k++) result = make_model(&run, k);
     if (result == GSF_OK && others) result = make_model(&run, -1);
@@ -939,23 +940,31 @@ static gsf_result run_scene(gsfix_app* app, void* user, size_t task) {
     return result;
 }
 
-static int is_scene_done(gsfix_app* app, void* user, size_t task) {
+static gsf_result run_scene(gsfix_app* app, void* user, size_t task) {
     const dataset_plan* plan = (const dataset_plan*)user;
+    return gsfix_make_dataset_scene(app, plan, plan->names[task], app->o.inputs[task]);
+}
+
+int gsfix_has_dataset_scene(gsfix_app* app, const dataset_plan* plan) {
     gsf_context* ctx = &app->ctx;
     const gsfix_path path = gsfix_pathf("%s/manifest.json", app->o.out);
     gsfix_scene_manifest manifest;
     gsf_buffer settings = {0};
-    (void)task;
     if (!gsfix_exists(path.s) || gsfix_exists(gsfix_pathf("%s/checkpoint", app->o.out).s)) return 0;
     gsf_append_bytes(ctx, &settings, plan->settings.data, plan->settings.size);
     gsf_append_bytes(ctx, &settings, "}", 1);
-    const gsf_result result = load_scene_manifest(ctx, path.s, &manifest);
+    const gsf_result result = gsfix_load_scene_manifest(ctx, path.s, &manifest);
     const int done = result == GSF_OK && !settings.failed &&
                      gsfix_compare_settings(ctx, path.s, &settings, &manifest.json, manifest.settings) == GSF_OK;
     if (result == GSF_OK) gsfix_free_scene_manifest(ctx, &manifest);
     gsf_destroy_buffer(ctx, &settings);
     ctx->error[0] = 0;
     return done;
+}
+
+static int is_scene_done(gsfix_app* app, void* user, size_t task) {
+    (void)task;
+    return gsfix_has_dataset_scene(app, (const dataset_plan*)user);
 }
 
 // ---- all scenes --------------------------------------------------------------------
@@ -973,7 +982,7 @@ static gsf_result merge_scene(gsfix_app* app, const char* name, gsf_buffer* t, d
     uint64_t size = 0, digest = 0;
     size_t frames = 0;
     double psnr = 0.0;
-    gsf_result result = load_scene_manifest(ctx, path.s, &m);
+    gsf_result result = gsfix_load_scene_manifest(ctx, path.s, &m);
     if (result != GSF_OK) return result;
     for (size_t i = 0; i < m.sequence_count; i++) frames += m.sequences[i].frames, psnr += m.sequences[i].psnr;
     if (strcmp(m.name, name) != 0 || !gsfix_digest_file(path.s, &size, &digest))
@@ -1026,19 +1035,30 @@ static gsf_result merge_dataset(gsfix_app* app, void* user) {
     return result;
 }
 
+int gsfix_make_dataset_plan(gsfix_app* app, dataset_plan** out) {
+    *out = (dataset_plan*)gsf_alloc_zeroed(&app->ctx, 1, sizeof **out);
+    if (!*out) return gsfix_failed(app);
+    return resolve_plan(app, *out);
+}
+
+void gsfix_destroy_dataset_plan(gsfix_app* app, dataset_plan* plan) {
+    if (!plan) return;
+    gsfix_names names = {plan->names, plan->names ? (size_t)app->o.input_count : 0};
+    gsfix_free_names(&app->ctx, &names);
+    gsf_destroy_buffer(&app->ctx, &plan->settings);
+    gsf_free(&app->ctx, plan);
+}
+
 int gsfix_run_dataset(gsfix_app* app) {
-    static const dataset_plan zero;
-    dataset_plan plan = zero;
-    int code = resolve_plan(app, &plan);
-    if (!code && gsfix_name_scenes(app, &plan.names) != GSF_OK) code = gsfix_failed(app);
+    dataset_plan* plan;
+    int code = gsfix_make_dataset_plan(app, &plan);
+    if (!code && gsfix_name_scenes(app, &plan->names) != GSF_OK) code = gsfix_failed(app);
     if (!code) {
-        const gsfix_tasks tasks = {plan.names, (size_t)app->o.input_count, &plan, claim_dataset, is_scene_done, run_scene,
-                                   merge_dataset};
+        const gsfix_tasks tasks = {plan->names, (size_t)app->o.input_count, plan, claim_dataset, is_scene_done, run_scene,
+                                   merge_dataset, NULL, 0};
         code = gsfix_run_tasks(app, &tasks);
     }
-    gsfix_names names = {plan.names, plan.names ? (size_t)app->o.input_count : 0};
-    gsfix_free_names(&app->ctx, &names);
-    gsf_destroy_buffer(&app->ctx, &plan.settings);
+    gsfix_destroy_dataset_plan(app, plan);
     return code;
 }
 
@@ -1057,7 +1077,7 @@ static gsf_result check_sequence(gsfix_app* app, const char* folder, gsfix_path 
     gsf_context* ctx = &app->ctx;
     gsfix_sequence q;
     double sum = 0.0, count = 0.0;
-    gsf_result result = load_sequence(ctx, path, &q);
+    gsf_result result = gsfix_load_sequence(ctx, path, &q);
     if (result != GSF_OK) return result;
     for (size_t i = 0; i < q.frame_count && result == GSF_OK; i++) {
         if (!q.frames[i].reference) sum += q.frames[i].psnr, count += 1.0;
@@ -1091,7 +1111,7 @@ gsf_result gsfix_info_dataset(gsfix_app* app, const char* path) {
     const gsfix_path folder = slash ? gsfix_pathf("%.*s", (int)(slash - path), path) : gsfix_pathf(".");
     dataset_sums sums = {0, 0, 0.0};
     gsfix_scene_manifest m;
-    gsf_result result = load_scene_manifest(ctx, path, &m);
+    gsf_result result = gsfix_load_scene_manifest(ctx, path, &m);
     if (result == GSF_OK) {
         for (size_t i = 0; i < m.sequence_count && result == GSF_OK; i++) {
             const gsfix_path file = gsfix_pathf("%s/%s", folder.s, m.sequences[i].file);

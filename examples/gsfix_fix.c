@@ -164,6 +164,7 @@ typedef struct fix_run {
     gsf_restorer restorer;
     int has_restorer;
     int comparing; // set during the run without repair, the first one of --compare
+    const gsfix_fix_task* task; // of another command, or NULL
     gsf_fixer* fixer;
     gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
@@ -311,7 +312,7 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
 
 static gsf_result add_curve_point(fix_run* run) {
     gsfix_history* h = &run->history;
-    if (!run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration))
+    if (run->task || !run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration))
         return GSF_OK;
     gsf_result result = GROW(run->ctx, h, curve, curve);
     gsfix_score* scores = (gsfix_score*)gsf_alloc(run->ctx, run->split.test_count, sizeof *scores);
@@ -779,8 +780,9 @@ static gsf_result open_fix_out(fix_run* run) {
     static const char* const always[] = {"checkpoint", "dit.checkpoint", "splats.ply", "metrics.json", "report.html"};
     static const char* const repair[] = {"fixed/round*_window*_*.png", "report/round*_window*_*.png"};
     const char* also = app->o.also ? app->o.also : "";
+    const size_t names = run->task ? 2 : sizeof always / sizeof *always; // for a task the checkpoints only
     gsf_result result = GSF_OK;
-    for (size_t i = 0; i < sizeof always / sizeof *always && result == GSF_OK; i++) result = gsfix_claim(app, "%s", always[i]);
+    for (size_t i = 0; i < names && result == GSF_OK; i++) result = gsfix_claim(app, "%s", always[i]);
     if (result == GSF_OK && strstr(also, "splat")) result = gsfix_claim(app, "splats.splat");
     if (result == GSF_OK && strstr(also, "spz")) result = gsfix_claim(app, "splats.spz");
     for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
@@ -788,8 +790,9 @@ static gsf_result open_fix_out(fix_run* run) {
         result = gsfix_claim(app, "test/%s.png", stem.s);
         if (result == GSF_OK && app->o.compare) result = gsfix_claim(app, "report/without/%s.png", stem.s);
     }
-    for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app); i++)
+    for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app) && !run->task; i++)
         result = gsfix_claim(app, "%s", repair[i]);
+    if (result == GSF_OK && run->task) result = run->task->claim_fn(app, run->task->user);
     if (result == GSF_OK) result = gsfix_open_out(app);
     return result == GSF_OK ? gsfix_claim_file(app, app->o.save_features) : result;
 }
@@ -906,8 +909,8 @@ static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
         round->frames++;
         round->confidence += mean_value(stats->confidence + i);
     }
-    if (result == GSF_OK && stats->restored) result = save_window(run, stats);
-    if (result == GSF_OK && stats->restored) result = keep_sample(run, stats);
+    if (result == GSF_OK && stats->restored && !run->task) result = save_window(run, stats);
+    if (result == GSF_OK && stats->restored && !run->task) result = keep_sample(run, stats);
     return result;
 }
 
@@ -1178,19 +1181,22 @@ static gsf_result finish(fix_run* run) {
     r.views = views;
     r.iterations = run->iterations;
     r.splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
-    gsf_result result = save_splats(run, r.splats);
+    r.render = run->setup.fix.train.render;
+    gsf_result result = run->task ? GSF_OK : save_splats(run, r.splats);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);
     r.mean = mean_score(views, run->split.test_count);
     r.without = mean_score(h->without, h->has_without ? run->split.test_count : 0);
     h->seconds_total = run->total_before + gsfix_now() - run->app->started;
-    if (result == GSF_OK) {
+    if (result == GSF_OK && run->task) {
+        result = run->task->finish_fn(run->app, &r, run->task->user);
+    } else if (result == GSF_OK) {
         write_metrics(run, &r);
         result = save_metrics(run);
+        if (result == GSF_OK) result = gsfix_write_report(run->app, &r);
+        if (result == GSF_OK) print_results(run, &r);
     }
-    if (result == GSF_OK) result = gsfix_write_report(run->app, &r);
-    if (result == GSF_OK) print_results(run, &r);
     gsf_free(ctx, views);
     return result;
 }
@@ -1214,13 +1220,13 @@ static void free_run(fix_run* run) {
     gsf_free(ctx, run->history.samples);
 }
 
-int gsfix_run_fix(gsfix_app* app) {
+gsf_result gsfix_fix_scene(gsfix_app* app, const gsfix_setup* setup, const gsfix_fix_task* task) {
     static const fix_run zero;
     fix_run run = zero;
     run.app = app;
     run.ctx = &app->ctx;
-    const int code = gsfix_resolve_setup(app, &run.setup);
-    if (code) return code;
+    run.task = task;
+    run.setup = *setup;
     run.iterations = run.setup.fix.train.iterations;
     run.eval_every = app->o.eval_every ? app->o.eval_every : run.iterations / 10 > 0 ? run.iterations / 10 : 1;
     run.checkpoint_every = app->o.checkpoint_every   ? app->o.checkpoint_every
@@ -1232,5 +1238,12 @@ int gsfix_run_fix(gsfix_app* app) {
     if (result == GSF_OK) result = finish(&run);
     if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     free_run(&run);
-    return result == GSF_OK ? 0 : gsfix_failed(app);
+    return result;
+}
+
+int gsfix_run_fix(gsfix_app* app) {
+    gsfix_setup setup;
+    const int code = gsfix_resolve_setup(app, &setup);
+    if (code) return code;
+    return gsfix_fix_scene(app, &setup, NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }

@@ -19,7 +19,6 @@
        OUT/.gsfix/manifest   "gsfix manifest 1", then a line per file: XXH64 of its bytes, size, command, name
        OUT/.gsfix/lock       locked by the run that is at work in OUT, as long as its process lives
        OUT/.gsfix/new        the file that is being written; renamed once it is whole
-       OUT/.gsfix/tasks      only where gsfix_mpi was at work: which tasks are done
    A file is ours as long as the manifest lists its name with its size and digest; once edited or replaced it is the user's.
    The line is written before the file is renamed into place, so that after a kill at any moment both the old and the new
    file are known. A truncated last line is ignored. Names are relative, so a copy of OUT takes its manifest along. Each run
@@ -648,7 +647,7 @@ static gsf_result check_own(gsfix_app* app) {
     gsf_result result = GSF_OK;
     for (struct dirent* entry; list && result == GSF_OK && (entry = readdir(list)) != NULL;)
         if (strcmp(entry->d_name, ".") && strcmp(entry->d_name, "..") && strcmp(entry->d_name, "lock") &&
-            strcmp(entry->d_name, "new") && strcmp(entry->d_name, "tasks"))
+            strcmp(entry->d_name, "new"))
             result = gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/.gsfix/%s: not written by gsfix (choose another --out)", app->o.out,
                               entry->d_name);
     if (list) closedir(list);

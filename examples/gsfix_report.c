@@ -11,16 +11,11 @@ enum {
     SAMPLE_BYTES = 1100000,    // share of the file for the repaired frames
     VIEWS_MOST = 12, SAMPLES_MOST = 6, CLOUD_POINTS = 6000,
 };
-static const double error_white = 0.3; // mean absolute error at the bright end of the error maps
+const double gsfix_error_white = 0.3; // mean absolute error at the bright end of the error maps
 
-typedef struct page {
-    gsf_context* ctx;
-    const gsfix_result* r;
-    gsf_buffer html;
-} page;
+typedef gsfix_page page;
 
-static void put(page* p, const char* format, ...) GSF_PRINTF(2, 3);
-static void put(page* p, const char* format, ...) {
+void gsfix_put(page* p, const char* format, ...) {
     char text[4096];
     va_list args;
     va_start(args, format);
@@ -29,16 +24,16 @@ static void put(page* p, const char* format, ...) {
     gsf_append_bytes(p->ctx, &p->html, text, n < 0 ? 0 : (size_t)n < sizeof text ? (size_t)n : sizeof text - 1);
 }
 
-static void put_raw(page* p, const char* text) { gsf_append_bytes(p->ctx, &p->html, text, strlen(text)); }
+void gsfix_put_raw(page* p, const char* text) { gsf_append_bytes(p->ctx, &p->html, text, strlen(text)); }
 
-static void put_lines(page* p, const char* const* lines) {
-    for (; *lines; lines++) put_raw(p, *lines);
+void gsfix_put_lines(page* p, const char* const* lines) {
+    for (; *lines; lines++) gsfix_put_raw(p, *lines);
 }
 
-static void put_escaped(page* p, const char* text) {
+void gsfix_put_escaped(page* p, const char* text) {
     for (; *text; text++) {
         const char* as = *text == '&' ? "&amp;" : *text == '<' ? "&lt;" : *text == '>' ? "&gt;" : *text == '"' ? "&quot;" : NULL;
-        if (as) put_raw(p, as);
+        if (as) gsfix_put_raw(p, as);
         else gsf_append_bytes(p->ctx, &p->html, text, 1);
     }
 }
@@ -62,33 +57,39 @@ static void put_base64(page* p, const char* data, size_t size) {
 
 // ---- images ----------------------------------------------------------------------
 
-static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { // u8; large images are shrunk
+gsf_result gsfix_put_jpeg(page* p, const gsf_image* image, int64_t most, int64_t* width, int64_t* height) {
     gsf_image small = {0};
     gsf_buffer bytes = {0};
     const int64_t side = image->width > image->height ? image->width : image->height;
     const gsf_image* shown = image;
     gsf_result result = GSF_OK;
-    if (side > PICTURE_SIDE) {
-        const int64_t width = (image->width * PICTURE_SIDE + side / 2) / side, height = (image->height * PICTURE_SIDE + side / 2) / side;
-        result = gsf_make_image(p->ctx, GSF_U8, width > 0 ? width : 1, height > 0 ? height : 1, image->channels, &small);
+    if (side > most) {
+        const int64_t w = (image->width * most + side / 2) / side, h = (image->height * most + side / 2) / side;
+        result = gsf_make_image(p->ctx, GSF_U8, w > 0 ? w : 1, h > 0 ? h : 1, image->channels, &small);
         if (result == GSF_OK) result = gsf_resize_image(p->ctx, image, GSF_RESIZE_PIL_LANCZOS, &small);
         shown = &small;
     }
     if (result == GSF_OK) result = gsf_encode_image(p->ctx, shown, ".jpg", &bytes);
-    if (result == GSF_OK) {
-        put(p, "<img alt=\"%s\" width=%d height=%d src=\"data:image/jpeg;base64,", alt, (int)shown->width, (int)shown->height);
-        put_base64(p, bytes.data, bytes.size);
-        put_raw(p, "\">");
-    }
+    if (result == GSF_OK) put_base64(p, bytes.data, bytes.size);
+    if (width) *width = shown->width;
+    if (height) *height = shown->height;
     gsf_destroy_buffer(p->ctx, &bytes);
     gsf_destroy_image(p->ctx, &small);
+    return result;
+}
+
+static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { // u8; large images are shrunk
+    int64_t width, height;
+    gsfix_put(p, "<img alt=\"%s\" src=\"data:image/jpeg;base64,", alt);
+    const gsf_result result = gsfix_put_jpeg(p, image, PICTURE_SIDE, &width, &height);
+    gsfix_put(p, "\" width=%d height=%d>", (int)width, (int)height);
     return result;
 }
 
 static gsf_result put_error_map(page* p, const gsf_image* a, const gsf_image* b, const char* alt) {
     gsf_image error = {0}, picture = {0};
     gsf_result result = gsfix_mean_abs_error(p->ctx, a, b, &error);
-    if (result == GSF_OK) result = gsfix_color_map(p->ctx, &error, 0.0, error_white, &picture);
+    if (result == GSF_OK) result = gsfix_color_map(p->ctx, &error, 0.0, gsfix_error_white, &picture);
     if (result == GSF_OK) result = put_image(p, &picture, alt);
     gsf_destroy_image(p->ctx, &error);
     gsf_destroy_image(p->ctx, &picture);
@@ -97,17 +98,17 @@ static gsf_result put_error_map(page* p, const gsf_image* a, const gsf_image* b,
 
 static gsf_result put_pane(page* p, const char* key, const char* side, const char* label, const gsf_image* a,
                            const gsf_image* b) { // b: show the difference from this image
-    put(p, "<div class=\"pane%s%s\" data-k=\"%s\">", *side ? " " : "", side, key);
+    gsfix_put(p, "<div class=\"pane%s%s\" data-k=\"%s\">", *side ? " " : "", side, key);
     const gsf_result result = b ? put_error_map(p, a, b, label) : put_image(p, a, label);
-    put(p, "<span>%s</span></div>", label);
+    gsfix_put(p, "<span>%s</span></div>", label);
     return result;
 }
 
 static void put_change(page* p, const char* name, double without, double with, int digits, const char* unit) {
     if (isnan(with)) return;
-    put(p, "<span>%s ", name);
-    if (!isnan(without)) put(p, "%.*f &rarr; ", digits, without);
-    put(p, "<b>%.*f</b>%s</span>", digits, with, unit);
+    gsfix_put(p, "<span>%s ", name);
+    if (!isnan(without)) gsfix_put(p, "%.*f &rarr; ", digits, without);
+    gsfix_put(p, "<b>%.*f</b>%s</span>", digits, with, unit);
 }
 
 static gsf_result put_view(page* p, size_t i) {
@@ -119,57 +120,57 @@ static gsf_result put_view(page* p, size_t i) {
     gsf_result result = gsf_load_image(p->ctx, gsfix_pathf("%s/test/%s.png", r->out, stem.s).s, 3, &with);
     if (result == GSF_OK && has_without)
         result = gsf_load_image(p->ctx, gsfix_pathf("%s/report/without/%s.png", r->out, stem.s).s, 3, &without);
-    put(p, "<figure class=card><div class=cmp style=\"aspect-ratio:%d/%d\">", (int)with.width, (int)with.height);
+    gsfix_put(p, "<figure class=card><div class=cmp style=\"aspect-ratio:%d/%d\">", (int)with.width, (int)with.height);
     if (result == GSF_OK) result = put_pane(p, "photo", has_without ? "" : "left", "photo", &view->image, NULL);
     if (result == GSF_OK && has_without) result = put_pane(p, "without", "left", "without repair", &without, NULL);
     if (result == GSF_OK) result = put_pane(p, "with", "right", has_without ? "with repair" : "result", &with, NULL);
     if (result == GSF_OK && has_without) result = put_pane(p, "error-without", "", "error without", &without, &view->image);
     if (result == GSF_OK) result = put_pane(p, "error", "", has_without ? "error with" : "error", &with, &view->image);
-    put_raw(p, "<i class=bar></i><input type=range min=0 max=1000 value=500 aria-label=\"divider between the two pictures\"></div>"
+    gsfix_put_raw(p, "<i class=bar></i><input type=range min=0 max=1000 value=500 aria-label=\"divider between the two pictures\"></div>"
                "<figcaption><strong>");
-    put_escaped(p, view->name);
-    put_raw(p, "</strong>");
+    gsfix_put_escaped(p, view->name);
+    gsfix_put_raw(p, "</strong>");
     const gsfix_score* was = has_without ? &r->history->without[i] : NULL;
     put_change(p, "PSNR", was ? was->psnr : NAN, r->views[i].psnr, 2, " dB");
     put_change(p, "seen", was ? was->psnr_seen : NAN, r->views[i].psnr_seen, 2, " dB");
     put_change(p, "SSIM", was ? was->ssim : NAN, r->views[i].ssim, 3, "");
-    put_raw(p, "</figcaption></figure>\n");
+    gsfix_put_raw(p, "</figcaption></figure>\n");
     gsf_destroy_image(p->ctx, &without);
     gsf_destroy_image(p->ctx, &with);
     return result;
 }
 
-static void put_legend(page* p) { // colour scale of the error maps
-    put_raw(p, "<div class=legend><span>error per pixel</span><span class=num>0</span><i style=\"background:linear-gradient(90deg");
+void gsfix_put_legend(page* p) { // colour scale of the error maps
+    gsfix_put_raw(p, "<div class=legend><span>error per pixel</span><span class=num>0</span><i style=\"background:linear-gradient(90deg");
     for (int i = 0; i <= 10; i++) {
         uint8_t c[3];
         gsfix_map_color(i / 10.0, c);
-        put(p, ",rgb(%d,%d,%d)", c[0], c[1], c[2]);
+        gsfix_put(p, ",rgb(%d,%d,%d)", c[0], c[1], c[2]);
     }
-    put(p, ")\"></i><span class=num>&ge; %.1f</span><span>mean absolute difference from the photo, colours from 0 to 1</span></div>\n",
-        error_white);
+    gsfix_put(p, ")\"></i><span class=num>&ge; %.1f</span><span>mean absolute difference from the photo, colours from 0 to 1</span></div>\n",
+        gsfix_error_white);
 }
 
 static gsf_result put_views(page* p) {
     const gsfix_result* r = p->r;
     const size_t count = r->split->test_count;
     if (!count) return GSF_OK;
-    put_raw(p, "<section><h2>Held-out views</h2><p>Photos that were not used for training. Drag the divider in an image to compare.");
+    gsfix_put_raw(p, "<section><h2>Held-out views</h2><p>Photos that were not used for training. Drag the divider in an image to compare.");
     if (r->history->has_without)
-        put(p, " <em>Without repair</em> is a second run from the same start and seed with the same number of steps (%d): the "
+        gsfix_put(p, " <em>Without repair</em> is a second run from the same start and seed with the same number of steps (%d): the "
                "difference, %+.2f dB on average, is what the repair alone contributes.",
             (int)r->iterations, r->mean.psnr - r->without.psnr);
-    put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
+    gsfix_put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
     if (r->history->has_without)
-        put_raw(p, "<button data-l=without data-r=with class=on>without | with repair</button><button data-l=photo data-r=with>photo | "
+        gsfix_put_raw(p, "<button data-l=without data-r=with class=on>without | with repair</button><button data-l=photo data-r=with>photo | "
                    "with repair</button><button data-l=photo data-r=without>photo | without repair</button>"
                    "<button data-l=error-without data-r=error>error without | with repair</button>");
     else
-        put_raw(p, "<button data-l=photo data-r=with class=on>photo | result</button><button data-l=with data-r=error>result | error"
+        gsfix_put_raw(p, "<button data-l=photo data-r=with class=on>photo | result</button><button data-l=with data-r=error>result | error"
                    "</button>");
-    put_raw(p, "</div>\n");
-    put_legend(p);
-    put_raw(p, "<div class=\"cards\">\n");
+    gsfix_put_raw(p, "</div>\n");
+    gsfix_put_legend(p);
+    gsfix_put_raw(p, "<div class=\"cards\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_view(p, 0);
     const size_t each = p->html.size - begin;
@@ -177,9 +178,9 @@ static gsf_result put_views(page* p) {
     if (shown > VIEWS_MOST) shown = VIEWS_MOST;
     if (shown > count) shown = count;
     for (size_t k = 1; k < shown && result == GSF_OK; k++) result = put_view(p, k * count / shown);
-    put_raw(p, "</div>");
-    if (shown < count) put(p, "<p class=small>%zu of %zu held-out views are shown; all are in test/ and in the table below.</p>", shown, count);
-    put_raw(p, "</section>\n");
+    gsfix_put_raw(p, "</div>");
+    if (shown < count) gsfix_put(p, "<p class=small>%zu of %zu held-out views are shown; all are in test/ and in the table below.</p>", shown, count);
+    gsfix_put_raw(p, "</section>\n");
     return result;
 }
 
@@ -187,17 +188,17 @@ static gsf_result put_sample(page* p, const gsfix_sample* s) {
     static const char* const names[] = {"render", "restored", "confidence"};
     static const char* const labels[] = {"render", "repaired", "confidence"};
     gsf_result result = GSF_OK;
-    put_raw(p, "<figure class=\"card triple\"><div>");
+    gsfix_put_raw(p, "<figure class=\"card triple\"><div>");
     for (int k = 0; k < 3 && result == GSF_OK; k++) {
         gsf_image image = {0};
         result = gsf_load_image(p->ctx, gsfix_pathf("%s/report/round%d_window%d_%s.png", p->r->out, (int)s->round,
                                                     (int)s->window, names[k]).s, k == 2 ? 1 : 3, &image);
-        put_raw(p, "<div class=still>");
+        gsfix_put_raw(p, "<div class=still>");
         if (result == GSF_OK) result = put_image(p, &image, labels[k]);
-        put(p, "<span>%s</span></div>", labels[k]);
+        gsfix_put(p, "<span>%s</span></div>", labels[k]);
         gsf_destroy_image(p->ctx, &image);
     }
-    put(p, "</div><figcaption><strong>round %d, window %d</strong><span>fixed/round%d_window%d_%05d.png</span></figcaption>"
+    gsfix_put(p, "</div><figcaption><strong>round %d, window %d</strong><span>fixed/round%d_window%d_%05d.png</span></figcaption>"
            "</figure>\n", (int)s->round, (int)s->window, (int)s->round, (int)s->window, (int)s->frame);
     return result;
 }
@@ -207,10 +208,10 @@ static gsf_result put_samples(page* p) {
     if (!h->sample_count) return GSF_OK;
     int restored = 0, skipped = 0;
     for (size_t i = 0; i < h->round_count; i++) restored += h->rounds[i].frames, skipped += h->rounds[i].skipped;
-    put(p, "<section><h2>Repaired frames</h2><p>Between training steps, frames along a camera path are rendered and repaired, and "
+    gsfix_put(p, "<section><h2>Repaired frames</h2><p>Between training steps, frames along a camera path are rendered and repaired, and "
            "training continues on the photos and the repaired frames: %d frames in %zu rounds", restored, h->round_count);
-    if (skipped) put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
-    put_raw(p, ". Confidence is the weight of each pixel in training; black pixels, where the repair may show seams, are "
+    if (skipped) gsfix_put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
+    gsfix_put_raw(p, ". Confidence is the weight of each pixel in training; black pixels, where the repair may show seams, are "
                "ignored.</p>\n<div class=\"cards broad\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_sample(p, &h->samples[0]);
@@ -219,7 +220,7 @@ static gsf_result put_samples(page* p) {
     if (shown > SAMPLES_MOST) shown = SAMPLES_MOST;
     if (shown > h->sample_count) shown = h->sample_count;
     for (size_t k = 1; k < shown && result == GSF_OK; k++) result = put_sample(p, &h->samples[k * h->sample_count / shown]);
-    put_raw(p, "</div></section>\n");
+    gsfix_put_raw(p, "</div></section>\n");
     return result;
 }
 
@@ -228,33 +229,33 @@ static gsf_result put_samples(page* p) {
 static void put_count(page* p, double x) { // 12345 as 12,345
     char digits[32];
     const int n = snprintf(digits, sizeof digits, "%.0f", x);
-    for (int i = 0; i < n; i++) put(p, "%c%s", digits[i], (n - 1 - i) % 3 == 0 && i + 1 < n && digits[i] != '-' ? "," : "");
+    for (int i = 0; i < n; i++) gsfix_put(p, "%c%s", digits[i], (n - 1 - i) % 3 == 0 && i + 1 < n && digits[i] != '-' ? "," : "");
 }
 
 static void put_tile(page* p, const char* name, double value, double without, int digits, const char* unit) {
     if (isnan(value)) return;
-    put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
+    gsfix_put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
     if (!isnan(without))
-        put(p, "<p class=%s>%+.*f%s from repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
-    put_raw(p, "</div>\n");
+        gsfix_put(p, "<p class=%s>%+.*f%s from repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
+    gsfix_put_raw(p, "</div>\n");
 }
 
 static void put_tiles(page* p) {
     const gsfix_result* r = p->r;
     const double seconds = r->history->seconds_total;
     const int has_without = r->history->has_without;
-    put_raw(p, "<dl class=tiles>\n");
+    gsfix_put_raw(p, "<dl class=tiles>\n");
     put_tile(p, "PSNR, held-out", r->mean.psnr, has_without ? r->without.psnr : NAN, 2, " dB");
     put_tile(p, "PSNR, seen pixels", r->mean.psnr_seen, has_without ? r->without.psnr_seen : NAN, 2, " dB");
     put_tile(p, "SSIM, held-out", r->mean.ssim, has_without ? r->without.ssim : NAN, 3, "");
-    put(p, "<div class=tile><dt>photos used</dt><dd>%zu<small> of %zu</small></dd></div>\n", r->split->train_count, r->scene->view_count);
-    put_raw(p, "<div class=tile><dt>splats</dt><dd>");
+    gsfix_put(p, "<div class=tile><dt>photos used</dt><dd>%zu<small> of %zu</small></dd></div>\n", r->split->train_count, r->scene->view_count);
+    gsfix_put_raw(p, "<div class=tile><dt>splats</dt><dd>");
     put_count(p, (double)r->splats->count);
-    put_raw(p, "</dd></div>\n<div class=tile><dt>time</dt><dd>");
-    if (seconds < 120.0) put(p, "%.1f<small> s</small>", seconds);
-    else put(p, "%.1f<small> min</small>", seconds / 60.0);
-    put(p, "</dd><p>%d steps</p></div>\n", (int)r->iterations);
-    put(p, "<div class=tile><dt>memory, peak</dt><dd>%.0f<small> MB</small></dd></div>\n</dl>\n", (double)gsfix_peak_memory() / 1e6);
+    gsfix_put_raw(p, "</dd></div>\n<div class=tile><dt>time</dt><dd>");
+    if (seconds < 120.0) gsfix_put(p, "%.1f<small> s</small>", seconds);
+    else gsfix_put(p, "%.1f<small> min</small>", seconds / 60.0);
+    gsfix_put(p, "</dd><p>%d steps</p></div>\n", (int)r->iterations);
+    gsfix_put(p, "<div class=tile><dt>memory, peak</dt><dd>%.0f<small> MB</small></dd></div>\n</dl>\n", (double)gsfix_peak_memory() / 1e6);
 }
 
 static double nice_step(double range, int wanted) {
@@ -266,16 +267,16 @@ typedef struct plot { double x0, y0, sx, sy; } plot; // iteration, dB -> SVG uni
 
 static void put_line(page* p, const plot* f, const gsfix_curve_point* points, size_t count, int seen, const char* kind,
                      const char* name) {
-    put(p, "<polyline class=\"%s\" points=\"", kind);
+    gsfix_put(p, "<polyline class=\"%s\" points=\"", kind);
     for (size_t i = 0; i < count; i++) {
         const double y = seen ? points[i].psnr_seen : points[i].psnr;
-        if (!isnan(y)) put(p, "%.1f,%.1f ", f->x0 + f->sx * points[i].iteration, f->y0 - f->sy * y);
+        if (!isnan(y)) gsfix_put(p, "%.1f,%.1f ", f->x0 + f->sx * points[i].iteration, f->y0 - f->sy * y);
     }
-    put_raw(p, "\"/>");
+    gsfix_put_raw(p, "\"/>");
     for (size_t i = 0; i < count; i++) {
         const double y = seen ? points[i].psnr_seen : points[i].psnr;
         if (!isnan(y))
-            put(p, "<circle class=\"%s\" cx=%.1f cy=%.1f r=3.2><title>step %d: %.2f dB (%s), %llu splats</title></circle>", kind,
+            gsfix_put(p, "<circle class=\"%s\" cx=%.1f cy=%.1f r=3.2><title>step %d: %.2f dB (%s), %llu splats</title></circle>", kind,
                 f->x0 + f->sx * points[i].iteration, f->y0 - f->sy * y, (int)points[i].iteration, y, name,
                 (unsigned long long)points[i].splats);
     }
@@ -310,33 +311,33 @@ static void put_curve(page* p) {
     f.x0 = LEFT;
     f.sy = (BOTTOM - TOP) / (high - low);
     f.y0 = BOTTOM + f.sy * low;
-    put_raw(p, "<section><h2>PSNR over the steps</h2><p>Mean over the held-out views, measured while training");
-    if (h->round_count) put_raw(p, "; vertical lines mark repair rounds");
-    put_raw(p, ".</p>\n<svg class=chart viewBox=\"0 0 720 290\" role=img aria-label=\"PSNR over training steps\">");
+    gsfix_put_raw(p, "<section><h2>PSNR over the steps</h2><p>Mean over the held-out views, measured while training");
+    if (h->round_count) gsfix_put_raw(p, "; vertical lines mark repair rounds");
+    gsfix_put_raw(p, ".</p>\n<svg class=chart viewBox=\"0 0 720 290\" role=img aria-label=\"PSNR over training steps\">");
     for (double y = low; y <= high + 0.01 * step; y += step)
-        put(p, "<line class=grid x1=%d x2=%d y1=%.1f y2=%.1f /><text x=%d y=%.1f text-anchor=end>%.*f</text>", LEFT, RIGHT,
+        gsfix_put(p, "<line class=grid x1=%d x2=%d y1=%.1f y2=%.1f /><text x=%d y=%.1f text-anchor=end>%.*f</text>", LEFT, RIGHT,
             f.y0 - f.sy * y, f.y0 - f.sy * y, LEFT - 8, f.y0 - f.sy * y + 4.0, step < 1.0 ? 1 : 0, y);
     const double x_step = nice_step(last, 6);
     for (double x = 0.0; x <= last * 1.001; x += x_step)
-        put(p, "<text x=%.1f y=%d text-anchor=middle>%.0f</text>", f.x0 + f.sx * x, BOTTOM + 20, x);
-    put(p, "<text x=%d y=14>dB</text><text x=%d y=%d text-anchor=end>step</text>", 12, RIGHT, BOTTOM + 36);
+        gsfix_put(p, "<text x=%.1f y=%d text-anchor=middle>%.0f</text>", f.x0 + f.sx * x, BOTTOM + 20, x);
+    gsfix_put(p, "<text x=%d y=14>dB</text><text x=%d y=%d text-anchor=end>step</text>", 12, RIGHT, BOTTOM + 36);
     for (size_t i = 0; i < h->round_count; i++) {
         const double x = f.x0 + f.sx * h->rounds[i].iteration;
-        put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>%s%d</text>", x, x, TOP - 18, BOTTOM,
+        gsfix_put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>%s%d</text>", x, x, TOP - 18, BOTTOM,
             x + 5.0, TOP - 9, i ? "" : "round ", (int)h->rounds[i].round); // rounds can be too close for more text
     }
     if (has_seen && h->without_count) put_line(p, &f, h->without_curve, h->without_count, 1, "seen without", "seen pixels, without repair");
     if (h->without_count) put_line(p, &f, h->without_curve, h->without_count, 0, "all without", "all pixels, without repair");
     if (has_seen) put_line(p, &f, h->curve, h->curve_count, 1, "seen", "seen pixels");
     put_line(p, &f, h->curve, h->curve_count, 0, "all", "all pixels");
-    put_raw(p, "</svg>\n");
+    gsfix_put_raw(p, "</svg>\n");
     if (has_seen || h->without_count) {
-        put_raw(p, "<p class=keys><span><i class=all></i>all pixels</span>");
-        if (has_seen) put_raw(p, "<span><i class=seen></i>pixels that a training view sees</span>");
-        if (h->without_count) put_raw(p, "<span><i class=\"all without\"></i>paler: as many steps without repair</span>");
-        put_raw(p, "</p>");
+        gsfix_put_raw(p, "<p class=keys><span><i class=all></i>all pixels</span>");
+        if (has_seen) gsfix_put_raw(p, "<span><i class=seen></i>pixels that a training view sees</span>");
+        if (h->without_count) gsfix_put_raw(p, "<span><i class=\"all without\"></i>paler: as many steps without repair</span>");
+        gsfix_put_raw(p, "</p>");
     }
-    put_raw(p, "</section>\n");
+    gsfix_put_raw(p, "</section>\n");
 }
 
 static void put_seconds(page* p) {
@@ -347,48 +348,48 @@ static void put_seconds(page* p) {
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];
-    put_raw(p, "<section><h2>Where the time went</h2><div class=stages>");
+    gsfix_put_raw(p, "<section><h2>Where the time went</h2><div class=stages>");
     for (int i = 0; i < GSFIX_STAGES; i++)
         if (h->seconds[i] > 0.002 * sum)
-            put(p, "<i class=s%d style=\"flex-grow:%.3f\" title=\"%s: %.1f s\"></i>", i, h->seconds[i] / sum, gsfix_stage_names[i], h->seconds[i]);
-    put_raw(p, "</div><table class=plain>");
+            gsfix_put(p, "<i class=s%d style=\"flex-grow:%.3f\" title=\"%s: %.1f s\"></i>", i, h->seconds[i] / sum, gsfix_stage_names[i], h->seconds[i]);
+    gsfix_put_raw(p, "</div><table class=plain>");
     for (int i = 0; i < GSFIX_STAGES; i++)
         if (h->seconds[i] > 0.0)
-            put(p, "<tr><td><i class=\"dot s%d\"></i>%s<td class=num>%.1f s<td class=num>%.0f %%<td class=wide>%s</tr>", i, gsfix_stage_names[i],
+            gsfix_put(p, "<tr><td><i class=\"dot s%d\"></i>%s<td class=num>%.1f s<td class=num>%.0f %%<td class=wide>%s</tr>", i, gsfix_stage_names[i],
                 h->seconds[i], 100.0 * h->seconds[i] / sum, what[i]);
-    put(p, "<tr class=mean><td>total<td class=num>%.1f s<td><td class=wide></tr></table></section>\n", h->seconds_total);
+    gsfix_put(p, "<tr class=mean><td>total<td class=num>%.1f s<td><td class=wide></tr></table></section>\n", h->seconds_total);
 }
 
 static void put_cell(page* p, double value, int digits) {
-    if (isnan(value)) put_raw(p, "<td class=num>&ndash;");
-    else put(p, "<td class=num>%.*f", digits, value);
+    if (isnan(value)) gsfix_put_raw(p, "<td class=num>&ndash;");
+    else gsfix_put(p, "<td class=num>%.*f", digits, value);
 }
 
 static void put_table(page* p) {
     const gsfix_result* r = p->r;
     const int has_without = r->history->has_without, has_seen = r->masks != NULL;
     if (!r->split->test_count) return;
-    put_raw(p, "<section><h2>Metrics per view</h2><div class=scroll><table><thead><tr><th>view");
-    if (has_without) put_raw(p, "<th>PSNR without repair, dB");
-    put_raw(p, has_without ? "<th>with, dB" : "<th>PSNR, dB");
-    if (has_seen) put_raw(p, has_without ? "<th>with, seen pixels, dB" : "<th>seen pixels, dB");
-    if (has_without) put_raw(p, "<th>SSIM without");
-    put_raw(p, has_without ? "<th>with" : "<th>SSIM");
-    put_raw(p, "</tr></thead><tbody>");
+    gsfix_put_raw(p, "<section><h2>Metrics per view</h2><div class=scroll><table><thead><tr><th>view");
+    if (has_without) gsfix_put_raw(p, "<th>PSNR without repair, dB");
+    gsfix_put_raw(p, has_without ? "<th>with, dB" : "<th>PSNR, dB");
+    if (has_seen) gsfix_put_raw(p, has_without ? "<th>with, seen pixels, dB" : "<th>seen pixels, dB");
+    if (has_without) gsfix_put_raw(p, "<th>SSIM without");
+    gsfix_put_raw(p, has_without ? "<th>with" : "<th>SSIM");
+    gsfix_put_raw(p, "</tr></thead><tbody>");
     for (size_t i = 0; i <= r->split->test_count; i++) {
         const int mean = i == r->split->test_count;
         const gsfix_score* now = mean ? &r->mean : &r->views[i];
         const gsfix_score* was = mean ? &r->without : &r->history->without[i];
-        put_raw(p, mean ? "<tr class=mean><td>mean" : "<tr><td>");
-        if (!mean) put_escaped(p, r->scene->views[r->split->test[i]].name);
+        gsfix_put_raw(p, mean ? "<tr class=mean><td>mean" : "<tr><td>");
+        if (!mean) gsfix_put_escaped(p, r->scene->views[r->split->test[i]].name);
         if (has_without) put_cell(p, was->psnr, 2);
         put_cell(p, now->psnr, 2);
         if (has_seen) put_cell(p, now->psnr_seen, 2);
         if (has_without) put_cell(p, was->ssim, 4);
         put_cell(p, now->ssim, 4);
-        put_raw(p, "</tr>");
+        gsfix_put_raw(p, "</tr>");
     }
-    put_raw(p, "</tbody></table></div></section>\n");
+    gsfix_put_raw(p, "</tbody></table></div></section>\n");
 }
 
 // How a switch of metrics.json is displayed: heading, meaning of zero (or less), and unit ("<x": placed before the value).
@@ -412,8 +413,8 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
 };
 
 static void put_number(page* p, double x) { // integers with all digits
-    if (x == floor(x) && fabs(x) < 1e15) put(p, "%.0f", x);
-    else put(p, "%.6g", x);
+    if (x == floor(x) && fabs(x) < 1e15) gsfix_put(p, "%.0f", x);
+    else gsfix_put(p, "%.6g", x);
 }
 
 static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, const char* zero, const char* unit) {
@@ -422,25 +423,25 @@ static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, c
         {"trajectory", "reference", "photo to photo"}, {"trajectory", "interpolate", "spline"}, {"trajectory", "spread", "all around"},
         {"init", "dense", "tracks, rays and stereo"},
     };
-    put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");
-    put_escaped(p, v->key);
-    put_raw(p, "</dt><dd>");
-    if (v->type == GSF_JSON_NUMBER && zero && v->number <= 0.0) put_raw(p, zero);
+    gsfix_put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");
+    gsfix_put_escaped(p, v->key);
+    gsfix_put_raw(p, "</dt><dd>");
+    if (v->type == GSF_JSON_NUMBER && zero && v->number <= 0.0) gsfix_put_raw(p, zero);
     else if (v->type == GSF_JSON_NUMBER) {
-        if (*unit == '<') put_raw(p, unit + 1);
+        if (*unit == '<') gsfix_put_raw(p, unit + 1);
         put_number(p, v->number);
-        if (*unit != '<') put_raw(p, unit);
+        if (*unit != '<') gsfix_put_raw(p, unit);
     } else if (v->type == GSF_JSON_STRING) {
-        put_escaped(p, v->string);
+        gsfix_put_escaped(p, v->string);
         for (size_t i = 0; i < sizeof meanings / sizeof *meanings; i++)
-            if (strcmp(meanings[i][0], v->key) == 0 && strcmp(meanings[i][1], v->string) == 0) put(p, " (%s)", meanings[i][2]);
+            if (strcmp(meanings[i][0], v->key) == 0 && strcmp(meanings[i][1], v->string) == 0) gsfix_put(p, " (%s)", meanings[i][2]);
     }
     for (uint32_t k = v->type == GSF_JSON_ARRAY ? v->child : 0; k; k = json->values[k].next) {
-        if (json->values[k].string) put_escaped(p, json->values[k].string);
+        if (json->values[k].string) gsfix_put_escaped(p, json->values[k].string);
         else put_number(p, json->values[k].number);
-        if (json->values[k].next) put_raw(p, ", ");
+        if (json->values[k].next) gsfix_put_raw(p, ", ");
     }
-    put_raw(p, "</dd></div>");
+    gsfix_put_raw(p, "</dd></div>");
 }
 
 static gsf_result put_switches(page* p, const char* command) {
@@ -449,23 +450,23 @@ static gsf_result put_switches(page* p, const char* command) {
     gsf_json json;
     gsf_result result = gsf_parse_json(p->ctx, "switches", p->r->switches, strlen(p->r->switches), &json);
     if (result != GSF_OK) return result;
-    put_raw(p, "<section><h2>How it was made</h2><pre>");
-    put_escaped(p, command);
-    put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives bit-identical results with any number of workers. "
+    gsfix_put_raw(p, "<section><h2>How it was made</h2><pre>");
+    gsfix_put_escaped(p, command);
+    gsfix_put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives bit-identical results with any number of workers. "
            "PSNR and SSIM compare the render, clamped to [0,1], with the 8-bit photo; SSIM is that of the 3DGS papers (11x11 Gaussian window). "
            "The settings of the run are listed below, with their names in metrics.json.</p>", GSF_VERSION,
         gsf_describe_cpu_level(p->ctx->cpu_level), p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
     for (int group = 0; group < GROUPS; group++) {
-        put(p, "<h3>%s</h3><dl class=switches>", groups[group]);
+        gsfix_put(p, "<h3>%s</h3><dl class=switches>", groups[group]);
         for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
             int k = 0;
             while (k < SWITCHES && strcmp(switches[k].key, json.values[i].key) != 0) k++;
             if (strcmp(k < SWITCHES ? switches[k].group : "Training", groups[group]) != 0) continue;
             put_switch(p, &json, &json.values[i], k < SWITCHES ? switches[k].zero : NULL, k < SWITCHES ? switches[k].unit : "");
         }
-        put_raw(p, "</dl>");
+        gsfix_put_raw(p, "</dl>");
     }
-    put_raw(p, "</section>\n");
+    gsfix_put_raw(p, "</section>\n");
     gsf_destroy_json(p->ctx, &json);
     return GSF_OK;
 }
@@ -532,7 +533,7 @@ static frame3 make_frame(const gsf_scene* scene) {
 }
 
 static void put_cameras(page* p, const frame3* f, const char* key, const uint32_t* views, size_t count) {
-    put(p, "\"%s\":[", key); // centre and the four corners of the image plane
+    gsfix_put(p, "\"%s\":[", key); // centre and the four corners of the image plane
     for (size_t i = 0; i < count; i++) {
         const gsf_camera* camera = &p->r->scene->views[views[i]].camera;
         double c2w[16], center[3];
@@ -540,18 +541,18 @@ static void put_cameras(page* p, const frame3* f, const char* key, const uint32_
         gsf_get_camera_c2w(camera, c2w);
         memcpy(center, c2w + 12, sizeof center);
         to_view(f, center, v);
-        put(p, "%s[%d,%d,%d", i ? "," : "", v[0], v[1], v[2]);
+        gsfix_put(p, "%s[%d,%d,%d", i ? "," : "", v[0], v[1], v[2]);
         for (int k = 0; k < 4; k++) {
             const double x = ((k == 1 || k == 2 ? camera->width : 0) - camera->cx) / camera->fx;
             const double y = ((k >= 2 ? camera->height : 0) - camera->cy) / camera->fy;
             double direction[3];
             for (int a = 0; a < 3; a++) direction[a] = c2w[a] * x + c2w[4 + a] * y + c2w[8 + a];
             turn_only(f, direction, 110.0, v);
-            put(p, ",%d,%d,%d", v[0], v[1], v[2]);
+            gsfix_put(p, ",%d,%d,%d", v[0], v[1], v[2]);
         }
-        put_raw(p, "]");
+        gsfix_put_raw(p, "]");
     }
-    put_raw(p, "],");
+    gsfix_put_raw(p, "],");
 }
 
 static void put_cloud(page* p, const frame3* f) { // coloured points of the splats that are visible enough
@@ -560,7 +561,7 @@ static void put_cloud(page* p, const frame3* f) { // coloured points of the spla
     size_t solid = 0, taken = 0, shown = 0;
     const float least = -1.4f; // logit of opacity 0.2
     for (size_t i = 0; i < s->count; i++) solid += s->opacity_logits[i] > least;
-    put_raw(p, "\"cloud\":[");
+    gsfix_put_raw(p, "\"cloud\":[");
     for (size_t i = 0; i < s->count; i++) {
         if (!(s->opacity_logits[i] > least)) continue;
         if (taken++ * CLOUD_POINTS / (solid + 1) < shown) continue; // evenly spaced sample
@@ -574,36 +575,36 @@ static void put_cloud(page* p, const frame3* f) { // coloured points of the spla
         }
         to_view(f, world, v);
         if (abs(v[0]) < 6000 && abs(v[1]) < 6000 && abs(v[2]) < 6000)
-            put(p, "%d,%d,%d,%d,", v[0], v[1], v[2], c[0] << 16 | c[1] << 8 | c[2]);
+            gsfix_put(p, "%d,%d,%d,%d,", v[0], v[1], v[2], c[0] << 16 | c[1] << 8 | c[2]);
     }
-    put_raw(p, "0],");
+    gsfix_put_raw(p, "0],");
 }
 
 static void put_scene(page* p) {
     const gsfix_result* r = p->r;
     const gsfix_history* h = r->history;
     const frame3 f = make_frame(r->scene);
-    put_raw(p, "<section><h2>Cameras and path</h2><p>Drag to rotate, use the buttons to zoom.</p>\n<div class=stage3>"
+    gsfix_put_raw(p, "<section><h2>Cameras and path</h2><p>Drag to rotate, use the buttons to zoom.</p>\n<div class=stage3>"
                "<canvas id=space aria-label=\"cameras, path and splats in three dimensions\"></canvas>"
                "<div class=zoom><button data-z=1.25 aria-label=closer>+</button><button data-z=0.8 aria-label=farther>&minus;</button></div></div>"
                "<p class=keys><span><i class=k-train></i>training photos</span><span><i class=k-test></i>held-out photos</span>");
     for (size_t i = 0; i < h->round_count && h->path_count; i++)
-        put(p, "<span><i class=\"k-path\" style=\"background:hsl(%d 85%% 72%%)\"></i>path of round %d</span>", 225 + 50 * (int)i, (int)h->rounds[i].round);
-    put_raw(p, "</p>\n<script type=\"application/json\" id=scene>{");
+        gsfix_put(p, "<span><i class=\"k-path\" style=\"background:hsl(%d 85%% 72%%)\"></i>path of round %d</span>", 225 + 50 * (int)i, (int)h->rounds[i].round);
+    gsfix_put_raw(p, "</p>\n<script type=\"application/json\" id=scene>{");
     put_cameras(p, &f, "train", r->split->train, r->split->train_count);
     put_cameras(p, &f, "test", r->split->test, r->split->test_count);
     put_cloud(p, &f);
-    put_raw(p, "\"paths\":[");
+    gsfix_put_raw(p, "\"paths\":[");
     for (size_t i = 0, open = 0; i < h->path_count; i++) {
         int v[3];
         const int fresh = i == 0 || h->path[i].round != h->path[i - 1].round || h->path[i].window != h->path[i - 1].window;
         to_view(&f, h->path[i].center, v);
-        if (fresh) put(p, "%s{\"round\":%d,\"at\":[", open ? "]}," : "", (int)h->path[i].round);
-        put(p, "%s%d,%d,%d", fresh ? "" : ",", v[0], v[1], v[2]);
+        if (fresh) gsfix_put(p, "%s{\"round\":%d,\"at\":[", open ? "]}," : "", (int)h->path[i].round);
+        gsfix_put(p, "%s%d,%d,%d", fresh ? "" : ",", v[0], v[1], v[2]);
         open = 1;
     }
-    put_raw(p, h->path_count ? "]}]}" : "]}");
-    put_raw(p, "</script></section>\n");
+    gsfix_put_raw(p, h->path_count ? "]}]}" : "]}");
+    gsfix_put_raw(p, "</script></section>\n");
 }
 
 // ---- page ------------------------------------------------------------------------
@@ -701,6 +702,15 @@ static const char* const script[] = { // in pieces, since C guarantees string li
     "window.addEventListener('resize',later);window.addEventListener('beforeprint',draw);draw()})();",
     NULL};
 
+void gsfix_put_head(page* p, const char* title) {
+    gsfix_put_raw(p, "<!doctype html>\n<html lang=en><head><meta charset=utf-8><meta name=viewport content=\"width=device-width,initial-scale=1\">"
+                     "<meta name=generator content=\"gsfix " GSF_VERSION "\"><title>");
+    gsfix_put_escaped(p, title);
+    gsfix_put_raw(p, "</title><style>");
+    gsfix_put_lines(p, style);
+    gsfix_put_raw(p, "</style></head><body>\n");
+}
+
 static void put_header(page* p) {
     const gsfix_result* r = p->r;
     const gsfix_history* h = r->history;
@@ -708,18 +718,14 @@ static void put_header(page* p) {
     gsfix_path name = gsfix_pathf("%s", folder);
     for (size_t n = strlen(name.s); n > 1 && (name.s[n - 1] == '/' || name.s[n - 1] == '.'); n--) name.s[n - 1] = 0;
     const char* title = strrchr(name.s, '/') && strrchr(name.s, '/')[1] ? strrchr(name.s, '/') + 1 : name.s;
-    put_raw(p, "<!doctype html>\n<html lang=en><head><meta charset=utf-8><meta name=viewport content=\"width=device-width,initial-scale=1\">"
-               "<meta name=generator content=\"gsfix " GSF_VERSION "\"><title>gsfixer: ");
-    put_escaped(p, title);
-    put_raw(p, "</title><style>");
-    put_lines(p, style);
-    put_raw(p, "</style></head><body>\n<p class=eyebrow>gsfixer report</p><h1>");
-    put_escaped(p, title);
-    put(p, "</h1><p class=lede>A 3D Gaussian Splatting scene from %zu photo%s, trained for %d steps", r->split->train_count,
+    gsfix_put_head(p, gsfix_pathf("gsfixer: %s", title).s);
+    gsfix_put_raw(p, "<p class=eyebrow>gsfixer report</p><h1>");
+    gsfix_put_escaped(p, title);
+    gsfix_put(p, "</h1><p class=lede>A 3D Gaussian Splatting scene from %zu photo%s, trained for %d steps", r->split->train_count,
         r->split->train_count == 1 ? "" : "s", (int)r->iterations);
-    if (h->round_count) put(p, " with %zu round%s of repair", h->round_count, h->round_count == 1 ? "" : "s");
-    if (r->split->test_count) put(p, ". The quality is measured on %zu photos that were not used for training", r->split->test_count);
-    put_raw(p, ".</p>\n");
+    if (h->round_count) gsfix_put(p, " with %zu round%s of repair", h->round_count, h->round_count == 1 ? "" : "s");
+    if (r->split->test_count) gsfix_put(p, ". The quality is measured on %zu photos that were not used for training", r->split->test_count);
+    gsfix_put_raw(p, ".</p>\n");
 }
 
 gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result_) {
@@ -733,9 +739,9 @@ gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result_) {
     put_seconds(&p);
     put_table(&p);
     if (result == GSF_OK) result = put_switches(&p, app->command_line);
-    put_raw(&p, "<script>");
-    put_lines(&p, script);
-    put_raw(&p, "</script></body></html>\n");
+    gsfix_put_raw(&p, "<script>");
+    gsfix_put_lines(&p, script);
+    gsfix_put_raw(&p, "</script></body></html>\n");
     if (result == GSF_OK)
         result = p.html.failed ? GSF_ERROR_OUT_OF_MEMORY
                                : gsf_write_file(&app->ctx, gsfix_pathf("%s/report.html", result_->out).s, p.html.data, p.html.size);

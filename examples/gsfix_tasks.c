@@ -88,25 +88,57 @@ static gsf_result run_task(gsfix_app* app, const gsfix_tasks* t, const char* out
     return result;
 }
 
-static gsf_result run_all(gsfix_app* app, const gsfix_tasks* t, const char* out) {
+void gsfix_note_task(gsfix_app* app, gsfix_tally* tally, size_t task, gsf_result result, const char* text) {
+    tally->done[task] = result == GSF_OK;
+    if (result == GSF_OK) return;
+    if (!text || !text[0]) text = "out of memory";
+    if (!tally->failed++) tally->why = result, snprintf(tally->first, sizeof tally->first, "%s", text);
+    if (tally->tasks->count > 1 && result != GSF_ERROR_CANCELLED) gsfix_note(app, "%s: %s", tally->tasks->names[task], text);
+}
+
+// A task whose predecessor has failed; its folder is not touched.
+static gsf_result skip_task(gsfix_app* app, const gsfix_tasks* t, size_t i) {
     gsf_context* ctx = &app->ctx;
-    char first[sizeof ctx->error] = "";
-    size_t failed = 0;
-    gsf_result result = GSF_OK, why = GSF_OK;
-    gsfix_json_begin(ctx, &app->json, "tasks", '[');
+    gsfix_json_begin(ctx, &app->json, NULL, '{');
+    gsfix_json_text(ctx, &app->json, "name", t->names[i]);
+    const gsf_result result = gsf_fail(ctx, GSF_ERROR_IO, "needs %s, which is not done", t->names[t->needs[i]]);
+    gsfix_json_text(ctx, &app->json, "error", ctx->error);
+    gsfix_json_end(ctx, &app->json, '}');
+    return result;
+}
+
+static gsf_result run_in_order(gsfix_app* app, const char* out, gsfix_tally* tally) {
+    const gsfix_tasks* t = tally->tasks;
+    gsf_result result = GSF_OK;
     for (size_t i = 0; i < t->count && result != GSF_ERROR_CANCELLED; i++) {
+        const int ready = !t->needs || t->needs[i] == i || tally->done[t->needs[i]];
         if (t->count > 1) gsfix_note(app, "%s (%zu of %zu)", t->names[i], i + 1, t->count);
-        result = run_task(app, t, out, i);
-        if (result == GSF_OK) continue;
-        const char* text = ctx->error[0] ? ctx->error : "out of memory";
-        if (!failed++) why = result, snprintf(first, sizeof first, "%s", text);
-        if (t->count > 1 && result != GSF_ERROR_CANCELLED) gsfix_note(app, "%s: %s", t->names[i], text);
+        result = ready ? run_task(app, t, out, i) : skip_task(app, t, i);
+        gsfix_note_task(app, tally, i, result, app->ctx.error);
+    }
+    return result == GSF_ERROR_CANCELLED ? result : GSF_OK;
+}
+
+static gsf_result run_all(gsfix_app* app, const gsfix_tasks* t, const char* out, size_t* done) {
+    gsf_context* ctx = &app->ctx;
+    gsfix_tally tally = {t, NULL, 0, GSF_OK, ""};
+    gsf_result result = GSF_OK;
+    tally.done = (uint8_t*)gsf_alloc_zeroed(ctx, t->count + 1, 1);
+    if (!tally.done) return GSF_ERROR_OUT_OF_MEMORY;
+    gsfix_json_begin(ctx, &app->json, "tasks", '[');
+    if (app->crew) {
+        gsfix_end_files(app); // the tasks' processes open their folders themselves
+        result = app->crew->run_fn(app, app->crew->user, &tally);
+    } else {
+        result = run_in_order(app, out, &tally);
     }
     gsfix_json_end(ctx, &app->json, ']');
-    if (!failed) return GSF_OK;
-    if (t->count == 1 || result == GSF_ERROR_CANCELLED)
-        return result == GSF_ERROR_CANCELLED ? result : gsf_fail(ctx, why, "%.400s", first);
-    return gsf_fail(ctx, why, "%zu of %zu not done, the first because of: %.350s", failed, t->count, first);
+    for (size_t i = 0; i < t->count; i++) *done += tally.done[i];
+    gsf_free(ctx, tally.done);
+    if (result != GSF_OK || !tally.failed) return result;
+    if (t->count == 1) return gsf_fail(ctx, tally.why, "%s", tally.first);
+    if (tally.failed == 1) return gsf_fail(ctx, tally.why, "1 of %zu not done: %s", t->count, tally.first);
+    return gsf_fail(ctx, tally.why, "%zu of %zu not done, the first because of: %.350s", tally.failed, t->count, tally.first);
 }
 
 static gsf_result list_tasks(gsfix_app* app, const gsfix_tasks* t) {
@@ -118,6 +150,16 @@ static gsf_result list_tasks(gsfix_app* app, const gsfix_tasks* t) {
     }
     gsfix_json_end(ctx, &app->json, ']');
     return GSF_OK;
+}
+
+// Merges what is there after some of the tasks have failed; the failure stays what is reported, unless merging fails, too.
+static gsf_result merge_partly(gsfix_app* app, const gsfix_tasks* t, const char* out, gsf_result why) {
+    gsf_context* ctx = &app->ctx;
+    char text[sizeof ctx->error];
+    memcpy(text, ctx->error, sizeof text);
+    gsf_result result = open_merged(app, t, out);
+    if (result == GSF_OK) result = t->merge_fn(app, t->user);
+    return result == GSF_OK ? gsf_fail(ctx, why, "%.500s", text) : result;
 }
 
 int gsfix_run_tasks(gsfix_app* app, const gsfix_tasks* t) {
@@ -134,9 +176,12 @@ int gsfix_run_tasks(gsfix_app* app, const gsfix_tasks* t) {
     } else {
         result = open_merged(app, t, out); // refuses early what the merge could not do
         if (result == GSF_OK && app->o.list_tasks) result = list_tasks(app, t);
-        else if (result == GSF_OK) result = run_all(app, t, out);
-        if (result == GSF_OK && !app->o.list_tasks) result = open_merged(app, t, out);
-        if (result == GSF_OK && !app->o.list_tasks) result = t->merge_fn(app, t->user);
+        else if (result == GSF_OK) {
+            result = run_all(app, t, out, &i);
+            if (result == GSF_OK) result = open_merged(app, t, out);
+            if (result == GSF_OK) result = t->merge_fn(app, t->user);
+            else if (i && t->merges_partly && result != GSF_ERROR_CANCELLED) result = merge_partly(app, t, out, result);
+        }
     }
     app->o.out = out;
     return result == GSF_OK ? 0 : gsfix_failed(app);

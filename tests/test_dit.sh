@@ -129,4 +129,10 @@ expect 1 "prompt_embeds.clip3" "$gsfix" fix "$scene" --out "$scratch/x" "${optio
 expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/bare" "${options[@]}" "${dit[@]}"
 expect 0 "the restorer takes 9 instead" "$gsfix" fix "$scene" --out "$scratch/y" "${options[@]}" "${from_photos[@]}" \
     --condition none --caption "a wall" --steps 1 --set "rounds=1,windows=1,window_frames=17,first_round=20,last_round=40"
+# gsfix evaluate compares conditions on restored sequences, in the paper's order.
+"$gsfix" evaluate "$scene" --out "$scratch/evaluate" --views 3 --restorers "dit:$scratch/all" --conditions both,2d --steps 1 \
+    --iterations 10 --max-size 48 --frames 3 --threads 1 --tables conditions > "$log" 2>&1 || fail "evaluate failed"
+[ "$(sed -n 's/^| \(dit [^|]*\) | tracks .*/\1/p' "$scratch/evaluate/tables.md" | tr '\n' ';')" = "dit w/o 3D tokens;dit full model;" ] ||
+    fail "the rows of the conditions"
+
 echo "$kills kills"
