@@ -9547,7 +9547,7 @@ static void gsf__model_columns(const gsf__model* model, gsf__column out[GSF__COL
 static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t needed) {
     if (needed <= model->capacity && model->block) return GSF_OK;
     if (needed > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "trainer: %zu splats are too many", needed);
-    size_t capacity = model->capacity + model->capacity / 2;
+    size_t capacity = model->capacity + model->capacity / 8; // a trainer grows at most once per densify_interval
     capacity = ((needed > capacity ? needed : capacity) + 64) & ~(size_t)63;
     gsf__model grown = *model;
     char* block = (char*)gsf_alloc_zeroed(ctx, gsf__model_layout(&grown, capacity, NULL), 1);
@@ -9903,12 +9903,17 @@ typedef struct gsf__densify_rule {
     const float* normals;  // (2, splits, 3) standard normal samples to use instead; NULL = draw them
 } gsf__densify_rule;
 
+static float gsf__densify_mean(float grad_sum, uint32_t visits) {
+    const float mean = visits ? grad_sum / (float)visits : 0.0f;
+    return mean <= FLT_MAX ? mean : 0.0f;
+}
+
 // The larger of the means over photos and over restored views. A common mean would let one kind dilute the other.
 static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
     float largest = 0.0f;
     for (int k = 0; k < 2; k++) {
-        const float mean = model->visits[k][i] ? model->grad_sum[k][i] / (float)model->visits[k][i] : 0.0f;
-        if (mean <= FLT_MAX && mean > largest) largest = mean;
+        const float mean = gsf__densify_mean(model->grad_sum[k][i], model->visits[k][i]);
+        if (mean > largest) largest = mean;
     }
     return largest;
 }
@@ -10641,6 +10646,29 @@ typedef struct gsf__visit_job {
     float half[2][2];        // half width and height of each
 } gsf__visit_job;
 
+// What the visit adds to the splat's gradient sum.
+static float gsf__visit_grad(const gsf__visit_job* job, int k, size_t i) {
+    const float* g = job->model->screen[k] + 2 * i;
+    const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
+    return norm <= FLT_MAX ? norm : 0.0f;
+}
+
+// The number of splats whose mean gradient will reach the threshold after the visit.
+static size_t gsf__visit_candidates(const gsf__visit_job* job, float threshold) {
+    const gsf__model* model = job->model;
+    size_t count = 0;
+    for (size_t i = 0; i < model->count; i++) {
+        int reached = 0;
+        for (int k = 0; k < 2; k++) {
+            const int seen = job->counts[k] && model->seen[k][i];
+            const float sum = seen ? model->grad_sum[k][i] + gsf__visit_grad(job, k, i) : model->grad_sum[k][i];
+            reached |= gsf__densify_mean(sum, model->visits[k][i] + (seen ? 1u : 0u)) >= threshold;
+        }
+        count += (size_t)reached;
+    }
+    return count;
+}
+
 static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__visit_job* job = (const gsf__visit_job*)arg;
     gsf__model* model = job->model;
@@ -10651,8 +10679,7 @@ static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
             float* g = model->screen[k] + 2 * i;
             if (model->seen[k][i]) {
-                const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
-                if (norm <= FLT_MAX) model->grad_sum[k][i] += norm;
+                model->grad_sum[k][i] += gsf__visit_grad(job, k, i);
                 model->visits[k][i]++;
             }
             g[0] = g[1] = 0.0f;
@@ -10909,10 +10936,10 @@ GSF_API gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer
     const int densify = iteration < d->densify_until && iteration > d->densify_from &&
                         iteration % d->densify_interval == 0;
     gsf_result result = gsf__trainer_gradients(ctx, trainer, iteration, &visits, &local);
-    if (result == GSF_OK && densify) { // reserve the worst case now: nothing may fail after Adam
+    if (result == GSF_OK && densify) { // reserve now: nothing may fail after Adam, which decides between clone and split
         const size_t room = d->max_splats > model->count ? d->max_splats - model->count : 0;
-        const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats)
-                                     : 2 * (room < model->count ? room : model->count);
+        const size_t found = d->mcmc ? 0 : gsf__visit_candidates(&visits, gsf__trainer_rule(trainer, iteration).grad);
+        const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats) : 2 * (room < found ? room : found);
         result = gsf__model_reserve(ctx, model, model->count + grown);
         gsf__trainer_refresh_view(trainer);
     }
