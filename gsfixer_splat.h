@@ -97,8 +97,8 @@
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
                thread trains, export a copy of the splats and use a rasterizer and a context of its own.
-   STACK       With gcc 12 at -O2 the largest frames are 16 KiB on the calling thread (CRC-32 of checkpoints) and 8 KiB on
-               workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
+   STACK       With gcc 12 at -O2 the largest frames are 16 KiB on the calling thread (CRC-32 of checkpoints) and 11 KiB
+               on workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
                convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
@@ -7764,7 +7764,8 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float 
     to = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(to), 0xd8));
     uint32_t mask = 0;
     for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
-        const __m256 first = _mm256_set1_ps((float)(GSF__STRIP * strip)), last = _mm256_set1_ps((float)(GSF__STRIP * strip + 3));
+        const float column = (float)(GSF__STRIP * strip);
+        const __m256 first = _mm256_set1_ps(column), last = _mm256_set1_ps(column + (float)(GSF__STRIP - 1));
         const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ), _mm256_cmp_ps(to, first, _CMP_GE_OQ));
         mask |= (uint32_t)_mm256_movemask_ps(met) << (8 * strip);
     }
