@@ -4619,6 +4619,7 @@ typedef struct gsf__vis_job {
     // without Embree: the eye's image as a grid of cells, each with the points to test
     int32_t* cells;            // (count) cell of the point, -1 = none
     gsf__disc_box* boxes;      // (count) cells that the disc touches
+    gsf__disc_box* chunk_boxes; // (chunks) rows of cells that a chunk's discs touch
     uint32_t* cell_begin;      // (cells + 2) offsets into cell_points
     uint32_t* cell_points;
     gsf__sight* sights;        // (count) valid for points that have a cell
@@ -4627,7 +4628,7 @@ typedef struct gsf__vis_job {
     int32_t side;              // number of cells along each side of the image
 } gsf__vis_job;
 
-enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
+enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 4096 };
 
 static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int32_t worker)) {
     gsf__parallel_for(ctx, (job->discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, chunk, job);
@@ -4850,22 +4851,34 @@ static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
     if (job->evidence) gsf__vis_run(ctx, job, gsf__vis_evidence_chunk);
 }
 
-// Returns what disc j adds to the cover of the ray from the eye to point i. Used with Embree and without.
-static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const gsf__sight* sight, size_t i, size_t j) {
+// A disc relative to an eye.
+typedef struct gsf__vis_disc {
+    double d[3], normal[3], plane, radius; // plane: distance of its plane from the eye, times the length of the normal
+} gsf__vis_disc;
+
+static gsf__vis_disc gsf__vis_disc_of(const gsf__vis_job* job, const gsf__eye* eye, size_t j) {
     const float *sphere = job->discs.spheres + 4 * j, *normal = job->discs.normals + 3 * j;
-    double d[3], plane = 0.0, slope = 0.0, q2 = 0.0;
+    gsf__vis_disc disc;
+    disc.plane = 0.0;
+    disc.radius = (double)sphere[3];
     for (int k = 0; k < 3; k++) {
-        d[k] = (double)sphere[k] - eye->center[k];
-        plane += d[k] * (double)normal[k];
-        slope += sight->direction[k] * (double)normal[k];
+        disc.d[k] = (double)sphere[k] - eye->center[k];
+        disc.normal[k] = (double)normal[k];
+        disc.plane += disc.d[k] * disc.normal[k];
     }
+    return disc;
+}
+
+// Returns what a disc adds to the cover of the ray from the eye to a point with a disc of radius `own`. Used with Embree
+// and without.
+static inline double gsf__vis_cover(const gsf__vis_disc* disc, const gsf__sight* sight, double own, double tolerance) {
+    const double *a = sight->direction, *n = disc->normal, *d = disc->d, radius = disc->radius;
+    const double behind = tolerance * (own > radius ? own : radius);
+    const double slope = a[0] * n[0] + a[1] * n[1] + a[2] * n[2];
     if (slope == 0.0) return 0.0;
-    const double t = plane / slope, radius = (double)sphere[3], own = (double)job->discs.spheres[4 * i + 3];
-    if (!(t > 0.0 && sight->distance - t >= (double)job->desc->tolerance * (own > radius ? own : radius))) return 0.0;
-    for (int k = 0; k < 3; k++) {
-        const double x = t * sight->direction[k] - d[k];
-        q2 += x * x;
-    }
+    const double t = disc->plane / slope;
+    if (!(t > 0.0 && sight->distance - t >= behind)) return 0.0;
+    const double x = t * a[0] - d[0], y = t * a[1] - d[1], z = t * a[2] - d[2], q2 = x * x + y * y + z * z;
     return q2 < radius * radius ? 1.0 - q2 / (radius * radius) : 0.0;
 }
 
@@ -4888,6 +4901,9 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     const double *m = camera->w2c, sx = (double)job->side / (double)camera->width;
     const double sy = (double)job->side / (double)camera->height;
     const size_t first = chunk * GSF__VIS_CHUNK;
+    gsf__disc_box* all = job->chunk_boxes + chunk;
+    memset(all, 0, sizeof *all);
+    all->y0 = (int16_t)job->side;
     for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
         job->cells[i] = -1;
         job->cover[i] = 0.0;
@@ -4913,13 +4929,16 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
         box->x0 = box->x1 = box->y0 = box->y1 = 0;
         if (c[2] + e[2] <= 0.0) continue;
         if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: may project anywhere
-            box->x1 = box->y1 = (int16_t)job->side;
+            box->x1 = box->y1 = all->y1 = (int16_t)job->side;
+            all->y0 = 0;
             continue;
         }
         gsf__vis_span(c[0], e[0], c[2] - e[2], c[2] + e[2], camera->fx * sx, camera->cx * sx, job->side,
                       &box->x0, &box->x1);
         gsf__vis_span(c[1], e[1], c[2] - e[2], c[2] + e[2], camera->fy * sy, camera->cy * sy, job->side,
                       &box->y0, &box->y1);
+        if (box->x0 < box->x1 && box->y0 < all->y0) all->y0 = box->y0;
+        if (box->x0 < box->x1 && box->y1 > all->y1) all->y1 = box->y1;
     }
 }
 
@@ -4931,15 +4950,21 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
     const int32_t y0 = (int32_t)band * job->side / GSF__VIS_BANDS, y1 = ((int32_t)band + 1) * job->side / GSF__VIS_BANDS;
     const uint32_t first = job->cell_begin[y0 * job->side], last = job->cell_begin[y1 * job->side];
     if (first == last) return;
+    const double tolerance = (double)job->desc->tolerance;
     for (size_t j = 0; j < job->discs.count; j++) {
-        const gsf__disc_box* box = job->boxes + j;
-        if (box->x0 >= box->x1) continue;
+        const gsf__disc_box *box = job->boxes + j, *chunk = job->chunk_boxes + j / GSF__VIS_CHUNK;
+        if (chunk->y0 >= y1 || chunk->y1 <= y0) { // discs of a chunk are neighbours
+            j = (j / GSF__VIS_CHUNK + 1) * GSF__VIS_CHUNK - 1;
+            continue;
+        }
+        if (box->x0 >= box->x1 || box->y0 >= y1 || box->y1 <= y0) continue;
+        const gsf__vis_disc disc = gsf__vis_disc_of(job, job->eye, j);
         for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
             const uint32_t* row = job->cell_begin + y * job->side; // the points of a row of cells are contiguous
             for (uint32_t k = row[box->x0]; k < row[box->x1]; k++) {
                 const uint32_t i = job->cell_points[k];
                 if (i != j && job->cover[i] < (double)job->limits[i])
-                    job->cover[i] += gsf__vis_cover(job, job->eye, job->sights + i, i, j);
+                    job->cover[i] += gsf__vis_cover(&disc, job->sights + i, (double)job->discs.spheres[4 * i + 3], tolerance);
             }
         }
     }
@@ -4951,11 +4976,12 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     const size_t n = job->discs.count, most = GSF__VIS_MAX_SIDE;
     job->side = GSF__VIS_BANDS;
-    while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points a cell
+    while ((size_t)job->side < most && 2 * (size_t)job->side * (size_t)job->side < n) job->side *= 2; // 2 points a cell
     const size_t cell_count = (size_t)job->side * (size_t)job->side;
     job->sights = (gsf__sight*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__sight));
     job->cells = (int32_t*)gsf__arena_alloc(&job->arena, n, sizeof(int32_t));
     job->boxes = (gsf__disc_box*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__disc_box));
+    job->chunk_boxes = (gsf__disc_box*)gsf__arena_alloc(&job->arena, n / GSF__VIS_CHUNK + 1, sizeof(gsf__disc_box));
     job->limits = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
     job->cover = (double*)gsf__arena_alloc(&job->arena, n, sizeof(double));
     job->cell_points = (uint32_t*)gsf__arena_alloc(&job->arena, n, sizeof(uint32_t));
@@ -5206,7 +5232,9 @@ static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
         args->valid[0] = 0;
         return;
     }
-    const double cover = gsf__vis_cover(q->job, q->eye, &q->sight, q->point, hit->primID);
+    const gsf__vis_disc disc = gsf__vis_disc_of(q->job, q->eye, hit->primID);
+    const double cover = gsf__vis_cover(&disc, &q->sight, (double)q->job->discs.spheres[4 * (size_t)q->point + 3],
+                                        (double)q->job->desc->tolerance);
     q->cover += cover;
     if (q->cover < q->limit) args->valid[0] = 0;
     if (cover > 0.0) gsf__embree_enqueue(q, hit->primID);
