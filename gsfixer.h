@@ -1161,11 +1161,14 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define GSF__LANES GSF__V(GSF__LANES)
 #define GSF__HALVES GSF__V(GSF__HALVES)
 
-// The copy of a kernel, or of a constant, for a CPU level. Kernels with an AVX-512 copy have a table of their own.
+// The copy of a kernel, or of a constant, for a CPU level; WIDE: of one that has an AVX-512 copy.
 #if GSF__X86
 #define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
+#define GSF__WIDE_KERNEL_OF(level, name) \
+    ((level) >= GSF_CPU_AVX512 ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #else
 #define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
+#define GSF__WIDE_KERNEL_OF GSF__KERNEL_OF
 #endif
 
 #define gsf__vf GSF__V(gsf__vf)
@@ -1598,6 +1601,7 @@ GSF__INLINE_AVX512 __m512 gsf__v_round_avx512(__m512 x) {
 GSF__INLINE_AVX512 __m512 gsf__v_floor_avx512(__m512 x) {
     return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
 }
+GSF__INLINE_AVX512 __m512 gsf__v_scale2_avx512(__m512 x, __m512 k) { return _mm512_scalef_ps(x, k); } // x 2^k
 GSF__INLINE_AVX512 __m512 gsf__v_ceil_avx512(__m512 x) {
     return _mm512_roundscale_ps(x, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC);
 }

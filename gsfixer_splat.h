@@ -97,8 +97,8 @@
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
                thread trains, export a copy of the splats and use a rasterizer and a context of its own.
-   STACK       With gcc 12 at -O2 the largest frames are 16 KiB on the calling thread (CRC-32 of checkpoints) and 8 KiB on
-               workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
+   STACK       With gcc 12 at -O2 the largest frames are 16 KiB on the calling thread (CRC-32 of checkpoints) and 11 KiB
+               on workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
                convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
@@ -4572,6 +4572,7 @@ typedef struct gsf__vis_job {
     // without Embree: the eye's image as a grid of cells, each with the points to test
     int32_t* cells;            // (count) cell of the point, -1 = none
     gsf__disc_box* boxes;      // (count) cells that the disc touches
+    gsf__disc_box* chunk_boxes; // (chunks) rows of cells that a chunk's discs touch
     uint32_t* cell_begin;      // (cells + 2) offsets into cell_points
     uint32_t* cell_points;
     gsf__sight* sights;        // (count) valid for points that have a cell
@@ -4580,7 +4581,7 @@ typedef struct gsf__vis_job {
     int32_t side;              // number of cells along each side of the image
 } gsf__vis_job;
 
-enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
+enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 4096 };
 
 static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int32_t worker)) {
     gsf__parallel_for(ctx, (job->discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, chunk, job);
@@ -4803,22 +4804,34 @@ static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
     if (job->evidence) gsf__vis_run(ctx, job, gsf__vis_evidence_chunk);
 }
 
-// Returns what disc j adds to the cover of the ray from the eye to point i. Used with Embree and without.
-static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const gsf__sight* sight, size_t i, size_t j) {
+// A disc relative to an eye.
+typedef struct gsf__vis_disc {
+    double d[3], normal[3], plane, radius; // plane: distance of its plane from the eye, times the length of the normal
+} gsf__vis_disc;
+
+static gsf__vis_disc gsf__vis_disc_of(const gsf__vis_job* job, const gsf__eye* eye, size_t j) {
     const float *sphere = job->discs.spheres + 4 * j, *normal = job->discs.normals + 3 * j;
-    double d[3], plane = 0.0, slope = 0.0, q2 = 0.0;
+    gsf__vis_disc disc;
+    disc.plane = 0.0;
+    disc.radius = (double)sphere[3];
     for (int k = 0; k < 3; k++) {
-        d[k] = (double)sphere[k] - eye->center[k];
-        plane += d[k] * (double)normal[k];
-        slope += sight->direction[k] * (double)normal[k];
+        disc.d[k] = (double)sphere[k] - eye->center[k];
+        disc.normal[k] = (double)normal[k];
+        disc.plane += disc.d[k] * disc.normal[k];
     }
+    return disc;
+}
+
+// Returns what a disc adds to the cover of the ray from the eye to a point with a disc of radius `own`. Used with Embree
+// and without.
+static inline double gsf__vis_cover(const gsf__vis_disc* disc, const gsf__sight* sight, double own, double tolerance) {
+    const double *a = sight->direction, *n = disc->normal, *d = disc->d, radius = disc->radius;
+    const double behind = tolerance * (own > radius ? own : radius);
+    const double slope = a[0] * n[0] + a[1] * n[1] + a[2] * n[2];
     if (slope == 0.0) return 0.0;
-    const double t = plane / slope, radius = (double)sphere[3], own = (double)job->discs.spheres[4 * i + 3];
-    if (!(t > 0.0 && sight->distance - t >= (double)job->desc->tolerance * (own > radius ? own : radius))) return 0.0;
-    for (int k = 0; k < 3; k++) {
-        const double x = t * sight->direction[k] - d[k];
-        q2 += x * x;
-    }
+    const double t = disc->plane / slope;
+    if (!(t > 0.0 && sight->distance - t >= behind)) return 0.0;
+    const double x = t * a[0] - d[0], y = t * a[1] - d[1], z = t * a[2] - d[2], q2 = x * x + y * y + z * z;
     return q2 < radius * radius ? 1.0 - q2 / (radius * radius) : 0.0;
 }
 
@@ -4841,6 +4854,9 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     const double *m = camera->w2c, sx = (double)job->side / (double)camera->width;
     const double sy = (double)job->side / (double)camera->height;
     const size_t first = chunk * GSF__VIS_CHUNK;
+    gsf__disc_box* all = job->chunk_boxes + chunk;
+    memset(all, 0, sizeof *all);
+    all->y0 = (int16_t)job->side;
     for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
         job->cells[i] = -1;
         job->cover[i] = 0.0;
@@ -4866,13 +4882,16 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
         box->x0 = box->x1 = box->y0 = box->y1 = 0;
         if (c[2] + e[2] <= 0.0) continue;
         if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: may project anywhere
-            box->x1 = box->y1 = (int16_t)job->side;
+            box->x1 = box->y1 = all->y1 = (int16_t)job->side;
+            all->y0 = 0;
             continue;
         }
         gsf__vis_span(c[0], e[0], c[2] - e[2], c[2] + e[2], camera->fx * sx, camera->cx * sx, job->side,
                       &box->x0, &box->x1);
         gsf__vis_span(c[1], e[1], c[2] - e[2], c[2] + e[2], camera->fy * sy, camera->cy * sy, job->side,
                       &box->y0, &box->y1);
+        if (box->x0 < box->x1 && box->y0 < all->y0) all->y0 = box->y0;
+        if (box->x0 < box->x1 && box->y1 > all->y1) all->y1 = box->y1;
     }
 }
 
@@ -4884,15 +4903,21 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
     const int32_t y0 = (int32_t)band * job->side / GSF__VIS_BANDS, y1 = ((int32_t)band + 1) * job->side / GSF__VIS_BANDS;
     const uint32_t first = job->cell_begin[y0 * job->side], last = job->cell_begin[y1 * job->side];
     if (first == last) return;
+    const double tolerance = (double)job->desc->tolerance;
     for (size_t j = 0; j < job->discs.count; j++) {
-        const gsf__disc_box* box = job->boxes + j;
-        if (box->x0 >= box->x1) continue;
+        const gsf__disc_box *box = job->boxes + j, *chunk = job->chunk_boxes + j / GSF__VIS_CHUNK;
+        if (chunk->y0 >= y1 || chunk->y1 <= y0) { // discs of a chunk are neighbours
+            j = (j / GSF__VIS_CHUNK + 1) * GSF__VIS_CHUNK - 1;
+            continue;
+        }
+        if (box->x0 >= box->x1 || box->y0 >= y1 || box->y1 <= y0) continue;
+        const gsf__vis_disc disc = gsf__vis_disc_of(job, job->eye, j);
         for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
             const uint32_t* row = job->cell_begin + y * job->side; // the points of a row of cells are contiguous
             for (uint32_t k = row[box->x0]; k < row[box->x1]; k++) {
                 const uint32_t i = job->cell_points[k];
                 if (i != j && job->cover[i] < (double)job->limits[i])
-                    job->cover[i] += gsf__vis_cover(job, job->eye, job->sights + i, i, j);
+                    job->cover[i] += gsf__vis_cover(&disc, job->sights + i, (double)job->discs.spheres[4 * i + 3], tolerance);
             }
         }
     }
@@ -4904,11 +4929,12 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     const size_t n = job->discs.count, most = GSF__VIS_MAX_SIDE;
     job->side = GSF__VIS_BANDS;
-    while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points a cell
+    while ((size_t)job->side < most && 2 * (size_t)job->side * (size_t)job->side < n) job->side *= 2; // 2 points a cell
     const size_t cell_count = (size_t)job->side * (size_t)job->side;
     job->sights = (gsf__sight*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__sight));
     job->cells = (int32_t*)gsf__arena_alloc(&job->arena, n, sizeof(int32_t));
     job->boxes = (gsf__disc_box*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__disc_box));
+    job->chunk_boxes = (gsf__disc_box*)gsf__arena_alloc(&job->arena, n / GSF__VIS_CHUNK + 1, sizeof(gsf__disc_box));
     job->limits = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
     job->cover = (double*)gsf__arena_alloc(&job->arena, n, sizeof(double));
     job->cell_points = (uint32_t*)gsf__arena_alloc(&job->arena, n, sizeof(uint32_t));
@@ -5159,7 +5185,9 @@ static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
         args->valid[0] = 0;
         return;
     }
-    const double cover = gsf__vis_cover(q->job, q->eye, &q->sight, q->point, hit->primID);
+    const gsf__vis_disc disc = gsf__vis_disc_of(q->job, q->eye, hit->primID);
+    const double cover = gsf__vis_cover(&disc, &q->sight, (double)q->job->discs.spheres[4 * (size_t)q->point + 3],
+                                        (double)q->job->desc->tolerance);
     q->cover += cover;
     if (q->cover < q->limit) args->valid[0] = 0;
     if (cover > 0.0) gsf__embree_enqueue(q, hit->primID);
@@ -6695,8 +6723,8 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
        bin       append each splat, in index order, to the lists of the 16x16 tiles that its ellipse overlaps; each
                  (splat, tile) pair owns a slot for that tile's share of the splat's gradient
        sort      sort each tile's list by depth, ties by index (radix sort of the float's bits)
-       forward   per tile: blend front to back, 8 pixels of a row at a time
-       backward  per tile: repeat forward, keeping alpha and T of every 8-pixel step; then go back to front
+       forward   per tile: blend front to back, in steps of 4 x 2 pixels or, with AVX-512, 4 x 4
+       backward  per tile: repeat forward, keeping alpha and T of every step; then go back to front
        gather    per splat: sum its slots in tile order, then backpropagate through the projection to the parameters
    Each stage is a parallel loop over chunks whose number depends only on sizes, never on the number of workers, and
    every sum has a fixed order. */
@@ -6704,10 +6732,14 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
 enum {
     GSF__TILE = 16,
     GSF__TILE_PIXELS = GSF__TILE * GSF__TILE,
-    GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 8 pixels of a row; step s: row s & 15, from column 8*(s >> 4)
+    GSF__STRIP = 4,                      // columns of a strip
+    GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 4 columns and 2 rows: splats are compact, so that this shape needs
+                                         // fewer steps than 8 pixels of a row
+    GSF__AHEAD = 8,                      // list entries whose steps are found together
     GSF__SLOT_FLOATS = 12,
     GSF__PROJECT_CHUNK = 256,            // splats
-    GSF__BUCKET = 4096,                  // steps that backward keeps at a time
+    GSF__BUCKET = 4096,                  // steps that backward keeps at a time, plus the rest of the last entries
+    GSF__KEPT_MOST = GSF__BUCKET + GSF__AHEAD * GSF__STEPS + 1,
 };
 
 #define GSF__ALPHA_MAX 0.99f
@@ -6738,10 +6770,20 @@ typedef struct gsf__step { // kept by backward per splat and 8 pixels
     float T[8];            // transmittance in front of the splat
 } gsf__step;
 
+typedef struct gsf__wide_step { float alpha[16], T[16]; } gsf__wide_step; // the same, by kernels with 16 lanes
+
+// Before an array or a variable that kernels read in whole cache lines: a vector across two is slow to load, and slower
+// to load soon after it was stored.
+#if defined(__GNUC__) || defined(__clang__)
+#define GSF__LINES __attribute__((aligned(64)))
+#else
+#define GSF__LINES
+#endif
+
 typedef struct gsf__step_head { uint32_t entry; uint32_t step; } gsf__step_head;
 
 typedef struct gsf__worker_scratch { // one per worker
-    gsf__step* steps;          // (GSF__BUCKET + GSF__STEPS + 1)
+    gsf__step* steps;          // (GSF__KEPT_MOST)
     gsf__step_head* heads;     // of the steps
     float* checkpoints;        // T of the tile's pixels at the start of each bucket
     uint32_t* checkpoint_entry; // the list entry that each bucket starts with
@@ -6787,7 +6829,7 @@ struct gsf_rasterizer {
     int has_depth;
 
     // Set by the trainer (lazy Adam), else NULL. Called before the SH of `splat` and of the splats after it up to the
-    // next multiple of 8 are read, if any of them is drawn. May be called for different chunks at the same time.
+    // next multiple of 16 are read, if any of them is drawn. May be called for different chunks at the same time.
     void (*wake)(void* user, size_t splat);
     void* wake_user;
 };
@@ -6937,6 +6979,7 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_PROJECT
+#define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_PROJECT
 
@@ -7309,8 +7352,8 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
     const size_t end = gsf__splat_chunk_end(job->r, chunk);
     const gsf_cpu_level level = gsf__footprint_level(job->view, job->level);
-    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__KERNEL_OF(level, GSF__LANES))
-        GSF__KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__WIDE_KERNEL_OF(level, GSF__LANES))
+        GSF__WIDE_KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
 }
 
 // ---- >>bin ---------------------------------------------------------------------
@@ -7498,8 +7541,10 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
 
 // ---- >>raster forward ----------------------------------------------------------
 
-/* A tile's pixels are stored as 32 steps of 8 pixels: arrays [step][lane]. T > 0: the pixel is still open; T < 0: it is
-   finished, and |T| is its final transmittance. `live` has a bit set for every step that has an open pixel. */
+/* A tile's pixels are stored as four strips of 4 columns; a strip is 8 steps of 4 columns and 2 rows, in which the two
+   rows alternate: arrays [strip][pair of rows][column][row]. So step s is in strip s >> 3 and rows 2*(s & 7) and the next.
+   With 16 lanes, a step is a block of 4 x 4 pixels. T > 0: the pixel is still open; T < 0: it is finished, and |T| is its
+   final transmittance. `live` has a bit set for every step that has an open pixel. */
 typedef struct gsf__tile {
     const gsf__record* records; // per splat
     const gsf__pair* pairs;     // the tile's list, front to back
@@ -7508,11 +7553,13 @@ typedef struct gsf__tile {
 } gsf__tile;
 
 typedef struct gsf__tile_state {
-    float T[GSF__TILE_PIXELS], r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS], z[GSF__TILE_PIXELS];
+    GSF__LINES float T[GSF__TILE_PIXELS];
+    float r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS], z[GSF__TILE_PIXELS];
 } gsf__tile_state;
 
 typedef struct gsf__tile_gradient { // derivatives of the loss, per pixel
-    float r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS];
+    GSF__LINES float r[GSF__TILE_PIXELS];
+    float g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS];
     float z[GSF__TILE_PIXELS], a[GSF__TILE_PIXELS]; // with respect to sum(w z) and sum(w)
     float behind[GSF__TILE_PIXELS];                 // B of gsf__reverse_scalar
 } gsf__tile_gradient;
@@ -7523,7 +7570,8 @@ typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
     void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
     // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry
-    // that brings the kept steps above GSF__BUCKET. Returns the entry to continue with, or tile->count when done.
+    // that brings the kept steps above GSF__BUCKET pixels / 8, or the last of those that are processed together with it.
+    // Returns the entry to continue with, or tile->count when done. step_count: of gsf__step or gsf__wide_step
     size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
                    size_t* step_count);
     // Goes back to front over kept steps and writes the sums of the gradient moments of each entry to its slot (12
@@ -7569,11 +7617,17 @@ static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, 
         if (!(half2 >= 0.0f)) continue;
         const float half = sqrtf(half2) + 0.02f;
         const float left = center[row] - half, right = center[row] + half;
-        if (left <= 7.0f && right >= 0.0f) mask |= 1u << row;
-        if (left <= 15.0f && right >= 8.0f) mask |= 1u << (row + 16);
+        for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+            const float first = (float)(GSF__STRIP * strip);
+            if (left <= first + (float)(GSF__STRIP - 1) && right >= first) mask |= 1u << (8 * strip + row / 2);
+        }
     }
     return mask;
 }
+
+// Row and column, in the tile, of a pixel of a step.
+static int gsf__step_row(int s, int lane) { return 2 * (s & 7) + lane % 2; }
+static int gsf__step_column(int s, int lane) { return GSF__STRIP * (s >> 3) + lane / 2; }
 
 static uint32_t gsf__live_steps(const float* T) {
     uint32_t live = 0;
@@ -7615,12 +7669,12 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
-            const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
+            const int s = gsf__lowest_bit(m);
             int open = 0;
             for (int lane = 0; lane < 8; lane++) {
-                const int k = 8 * s + lane;
-                const float T = state->T[k];
-                const float raw = gsf__blend_pixel(rec, (float)(column + lane), center[row], exponent[row], &state->T[k]);
+                const int k = 8 * s + lane, row = gsf__step_row(s, lane);
+                const float T = state->T[k], column = (float)gsf__step_column(s, lane);
+                const float raw = gsf__blend_pixel(rec, column, center[row], exponent[row], &state->T[k]);
                 const float w = (raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX) * T;
                 if (raw > 0.0f) {
                     state->r[k] += w * rec->r;
@@ -7637,32 +7691,64 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
 
 #if GSF__X86
 
-// Like gsf__rows_scalar, 8 rows at a time, but with a centre (relative to the step's first pixel) and exponent per
-// step.
-GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile, float center[GSF__STEPS],
-                                         float exponent[GSF__STEPS]) {
-    const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
+// Columns of the pixels of strip k, from 16 k on, and rows of those of a pair of rows j, from 8 j on: for one or two steps.
+GSF__LINES static const float gsf__columns_of[64] = {0,  0,  1,  1,  2,  2,  3,  3,  0,  0,  1,  1,  2,  2,  3,  3,
+                                                     4,  4,  5,  5,  6,  6,  7,  7,  4,  4,  5,  5,  6,  6,  7,  7,
+                                                     8,  8,  9,  9,  10, 10, 11, 11, 8,  8,  9,  9,  10, 10, 11, 11,
+                                                     12, 12, 13, 13, 14, 14, 15, 15, 12, 12, 13, 13, 14, 14, 15, 15};
+GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,  2,  3,  2,  3,  2,  3,  2,  3,
+                                                  4,  5,  4,  5,  4,  5,  4,  5,  6,  7,  6,  7,  6,  7,  6,  7,
+                                                  8,  9,  8,  9,  8,  9,  8,  9,  10, 11, 10, 11, 10, 11, 10, 11,
+                                                  12, 13, 12, 13, 12, 13, 12, 13, 14, 15, 14, 15, 14, 15, 14, 15};
+
+// The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
+// compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
+typedef struct gsf__batch {
+    GSF__LINES float raw[GSF__AHEAD * GSF__TILE_PIXELS]; // of each item: alpha before the clamp, 0 where below 1/255
+    uint32_t items[GSF__AHEAD * GSF__STEPS + 16];     // entry << 8 | step, in the order of the list
+    float u[GSF__AHEAD], v[GSF__AHEAD];               // centres, relative to the tile
+    const gsf__record* rec[GSF__AHEAD];
+} gsf__batch;
+
+GSF__INLINE_AVX2 const gsf__record* gsf__batch_entry(const gsf__tile* tile, size_t i, size_t at, gsf__batch* batch) {
+    const gsf__record* rec = tile->records + tile->pairs[i].splat;
+    if (i + 2 * GSF__AHEAD < tile->count)
+        _mm_prefetch((const char*)(tile->records + tile->pairs[i + 2 * GSF__AHEAD].splat), _MM_HINT_T0);
+    batch->rec[at] = rec;
+    batch->u[at] = rec->u - tile->x0 + rec->u_low;
+    batch->v[at] = rec->v - tile->y0 + rec->v_low;
+    return rec;
+}
+
+// Like gsf__rows_scalar, 8 rows at a time.
+GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float v, float center[GSF__TILE],
+                                         float exponent[GSF__TILE]) {
     const __m256 kx = _mm256_set1_ps(rec->kx), yy = _mm256_set1_ps(rec->yy), lo = _mm256_set1_ps(rec->log2_opacity);
     const __m256 h0 = _mm256_set1_ps(rec->h0), h1 = _mm256_set1_ps(rec->h1), zero = _mm256_setzero_ps();
-    uint32_t mask = 0;
+    __m256 left[2], right[2];
     for (int k = 0; k < 2; k++) {
         const __m256 row = _mm256_add_ps(_mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_ps(8.0f * (float)k));
-        const __m256 dy = _mm256_sub_ps(row, v);
+        const __m256 dy = _mm256_sub_ps(row, _mm256_set1_ps(v));
         const __m256 half2 = _mm256_fnmadd_ps(_mm256_mul_ps(h1, dy), dy, h0);
-        const __m256 c = _mm256_fmadd_ps(kx, dy, u), second_c = _mm256_sub_ps(c, _mm256_set1_ps(8.0f));
-        const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo);
+        const __m256 c = _mm256_fmadd_ps(kx, dy, _mm256_set1_ps(u));
         _mm256_storeu_ps(center + 8 * k, c);
-        _mm256_storeu_ps(center + 16 + 8 * k, second_c);
-        _mm256_storeu_ps(exponent + 8 * k, x);
-        _mm256_storeu_ps(exponent + 16 + 8 * k, x);
-        const __m256 half = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
-        const __m256 met = _mm256_cmp_ps(half2, zero, _CMP_GE_OQ), seven = _mm256_set1_ps(7.0f);
-        const __m256 first = _mm256_and_ps(_mm256_cmp_ps(_mm256_sub_ps(c, half), seven, _CMP_LE_OQ),
-                                           _mm256_cmp_ps(_mm256_add_ps(c, half), zero, _CMP_GE_OQ));
-        const __m256 second = _mm256_and_ps(_mm256_cmp_ps(_mm256_sub_ps(second_c, half), seven, _CMP_LE_OQ),
-                                            _mm256_cmp_ps(_mm256_add_ps(second_c, half), zero, _CMP_GE_OQ));
-        mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, first)) << (8 * k);
-        mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, second)) << (8 * k + 16);
+        _mm256_storeu_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
+        const __m256 wide = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
+        const __m256 half = _mm256_blendv_ps(_mm256_set1_ps(-1e30f), wide, _mm256_cmp_ps(half2, zero, _CMP_GE_OQ));
+        left[k] = _mm256_sub_ps(c, half);
+        right[k] = _mm256_add_ps(c, half);
+    }
+    // of two rows, the union, which has no gap because the ellipse is convex; pairs of rows 0 1 4 5 2 3 6 7
+    __m256 from = _mm256_min_ps(_mm256_shuffle_ps(left[0], left[1], 0x88), _mm256_shuffle_ps(left[0], left[1], 0xdd));
+    __m256 to = _mm256_max_ps(_mm256_shuffle_ps(right[0], right[1], 0x88), _mm256_shuffle_ps(right[0], right[1], 0xdd));
+    from = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(from), 0xd8));
+    to = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(to), 0xd8));
+    uint32_t mask = 0;
+    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+        const float column = (float)(GSF__STRIP * strip);
+        const __m256 first = _mm256_set1_ps(column), last = _mm256_set1_ps(column + (float)(GSF__STRIP - 1));
+        const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ), _mm256_cmp_ps(to, first, _CMP_GE_OQ));
+        mask |= (uint32_t)_mm256_movemask_ps(met) << (8 * strip);
     }
     return mask;
 }
@@ -7680,97 +7766,177 @@ GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
-// Runs the row tests of eight list entries ahead of blending them, which then waits neither for records from memory nor
-// for the tests. Must be called for every entry i >= first in turn.
-enum { GSF__AHEAD = 8 };
-typedef struct gsf__row_tests { // indexed by i % GSF__AHEAD
-    float center[GSF__AHEAD][GSF__STEPS], exponent[GSF__AHEAD][GSF__STEPS];
-    uint32_t mask[GSF__AHEAD];
-} gsf__row_tests;
-
-GSF__INLINE_AVX2 void gsf__rows_ahead_avx2(const gsf__tile* tile, size_t first, size_t i, gsf__row_tests* tests) {
-    if (i + 4 * GSF__AHEAD < tile->count)
-        _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4 * GSF__AHEAD].splat), _MM_HINT_T0);
-    if (i != first && i % GSF__AHEAD != 0) return;
-    const size_t next = (i / GSF__AHEAD + 1) * GSF__AHEAD, end = next < tile->count ? next : tile->count;
-    for (size_t k = i; k < end; k++) {
-        const size_t at = k % GSF__AHEAD;
-        tests->mask[at] = gsf__rows_avx2(tile->records + tile->pairs[k].splat, tile, tests->center[at], tests->exponent[at]);
+// Lists the steps of the entries from `first` to `end` that are in `live`; returns their number.
+GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, size_t end, uint32_t live, gsf__batch* batch) {
+    GSF__LINES float center[GSF__AHEAD][GSF__TILE];
+    GSF__LINES float exponent[GSF__AHEAD][GSF__TILE];
+    uint32_t masks[GSF__AHEAD];
+    size_t count = 0;
+    for (size_t i = first, at = 0; i < end; i++, at++) {
+        const gsf__record* rec = gsf__batch_entry(tile, i, at, batch);
+        masks[at] = gsf__rows_avx2(rec, batch->u[at], batch->v[at], center[at], exponent[at]) & live;
     }
+    for (size_t at = 0; at < end - first; at++) {
+        const __m256 ee = _mm256_set1_ps(batch->rec[at]->ee);
+        for (uint32_t m = masks[at]; m; m &= m - 1, count++) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
+            const double* centers = (const double*)(const void*)(center[at] + 2 * (s & 7)); // of two rows
+            const double* exponents = (const double*)(const void*)(exponent[at] + 2 * (s & 7));
+            const __m256 c = _mm256_castpd_ps(_mm256_broadcast_sd(centers));
+            const __m256 e = _mm256_sub_ps(_mm256_load_ps(gsf__columns_of + 16 * (s >> 3)), c);
+            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_castpd_ps(_mm256_broadcast_sd(exponents)));
+            const __m256 seen = _mm256_cmp_ps(x, _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
+            batch->items[count] = (uint32_t)at << 8 | s;
+            _mm256_storeu_ps(batch->raw + 8 * count, _mm256_and_ps(seen, gsf__exp2_avx2(x)));
+        }
+    }
+    return count;
 }
 
-// Alpha before the clamp at the steps of `mask`, 0 where it is below 1/255. Kept out of the blending loop, where each
-// splat depends on the T of the one before: this long computation does not, so the CPU can run ahead with it.
-GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float center[GSF__STEPS],
-                                       const float exponent[GSF__STEPS], uint32_t mask, float raw[GSF__TILE_PIXELS]) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN);
-    const __m256 ee = _mm256_set1_ps(rec->ee);
-    for (uint32_t m = mask; m; m &= m - 1) {
-        const size_t s = (size_t)gsf__lowest_bit(m);
-        const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
-        const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
-        const __m256 seen = _mm256_cmp_ps(x, threshold, _CMP_GE_OQ);
-        _mm256_storeu_ps(raw + 8 * s, _mm256_and_ps(seen, gsf__exp2_avx2(x)));
-    }
+// Blends alphas (after the clamp) into T. Finished pixels keep theirs, which is negative. *shown: where the splat is
+// blended. Without branches, because it is hard to predict when a pixel finishes.
+GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 T, __m256 alpha, __m256* weight, __m256* shown) {
+    const __m256 open = _mm256_max_ps(T, _mm256_setzero_ps()), next = _mm256_fnmadd_ps(open, alpha, T);
+    *shown = _mm256_cmp_ps(next, _mm256_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
+    *weight = _mm256_and_ps(*shown, _mm256_mul_ps(open, alpha));
+    return _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, *shown);
 }
 
-// While this runs, a finished pixel has T = 0, which later splats leave unchanged, and its final T is in `ends`. So a
-// step needs extra work only when another of its pixels finishes.
-GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
-    const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
-    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
-    gsf__row_tests tests;
-    float raws[GSF__TILE_PIXELS];
-    float ends[GSF__TILE_PIXELS]; // T of the finished pixels, as `state` stores it
-    int ended[GSF__STEPS];        // per step a bit for every finished pixel
+GSF__INLINE_AVX2 uint32_t gsf__live_avx2(const float* T) {
     uint32_t live = 0;
-    for (uint32_t s = 0; s < GSF__STEPS; s++) {
-        const __m256 T = _mm256_loadu_ps(state->T + 8 * s), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
-        _mm256_storeu_ps(ends + 8 * s, T);
-        _mm256_storeu_ps(state->T + 8 * s, _mm256_and_ps(T, open));
-        ended[s] = _mm256_movemask_ps(open) ^ 255;
-        live |= (uint32_t)(ended[s] != 255) << s;
-    }
-    for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
-        gsf__rows_ahead_avx2(tile, 0, i, &tests);
-        const size_t at_test = i % GSF__AHEAD;
-        const uint32_t mask = tests.mask[at_test] & live;
-        gsf__alphas_avx2(rec, tests.center[at_test], tests.exponent[at_test], mask, raws);
-        const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
-        for (uint32_t m = mask; m; m &= m - 1) {
-            const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
-            const __m256 T = _mm256_loadu_ps(state->T + at);
-            __m256 alpha = _mm256_min_ps(_mm256_loadu_ps(raws + at), alpha_max), next = _mm256_fnmadd_ps(T, alpha, T);
-            const __m256 low = _mm256_cmp_ps(next, t_min, _CMP_LT_OQ);
-            if (_mm256_movemask_ps(low) != ended[s]) { // a pixel finishes in front of this splat
-                const __m256 stop = _mm256_and_ps(low, _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
-                _mm256_storeu_ps(ends + at, _mm256_blendv_ps(_mm256_loadu_ps(ends + at), _mm256_xor_ps(T, minus), stop));
-                alpha = _mm256_andnot_ps(stop, alpha);
-                next = _mm256_andnot_ps(stop, next);
-                ended[s] = _mm256_movemask_ps(low);
-                if (ended[s] == 255) live &= ~(1u << s);
-            }
-            const __m256 w = _mm256_mul_ps(alpha, T);
-            _mm256_storeu_ps(state->T + at, next);
-            _mm256_storeu_ps(state->r + at, _mm256_fmadd_ps(w, cr, _mm256_loadu_ps(state->r + at)));
-            _mm256_storeu_ps(state->g + at, _mm256_fmadd_ps(w, cg, _mm256_loadu_ps(state->g + at)));
-            _mm256_storeu_ps(state->b + at, _mm256_fmadd_ps(w, cb, _mm256_loadu_ps(state->b + at)));
+    for (uint32_t s = 0; s < GSF__STEPS; s++) live |= (uint32_t)(_mm256_movemask_ps(_mm256_loadu_ps(T + 8 * s)) != 255) << s;
+    return live;
+}
+
+GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
+    gsf__batch batch;
+    uint32_t live = gsf__live_avx2(state->T);
+    for (size_t i = 0, end; i < tile->count && live; i = end, live = gsf__live_avx2(state->T)) {
+        end = i + GSF__AHEAD < tile->count ? i + GSF__AHEAD : tile->count;
+        const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
+        for (size_t k = 0; k < count; k++) {
+            const size_t at = 8 * (batch.items[k] & 255u);
+            const gsf__record* rec = batch.rec[batch.items[k] >> 8];
+            const __m256 alpha = _mm256_min_ps(_mm256_loadu_ps(batch.raw + 8 * k), _mm256_set1_ps(GSF__ALPHA_MAX));
+            __m256 w, shown;
+            _mm256_storeu_ps(state->T + at, gsf__next_avx2(_mm256_loadu_ps(state->T + at), alpha, &w, &shown));
+            _mm256_storeu_ps(state->r + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->r), _mm256_loadu_ps(state->r + at)));
+            _mm256_storeu_ps(state->g + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->g), _mm256_loadu_ps(state->g + at)));
+            _mm256_storeu_ps(state->b + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->b), _mm256_loadu_ps(state->b + at)));
             if (with_depth)
                 _mm256_storeu_ps(state->z + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
                                                                 _mm256_loadu_ps(state->z + at)));
         }
-    }
-    for (uint32_t s = 0; s < GSF__STEPS; s++) {
-        const __m256 T = _mm256_loadu_ps(state->T + 8 * s);
-        _mm256_storeu_ps(state->T + 8 * s, _mm256_blendv_ps(_mm256_loadu_ps(ends + 8 * s), T,
-                                                            _mm256_cmp_ps(T, zero, _CMP_GT_OQ)));
     }
 }
 
 GSF__TARGET_AVX2 static void gsf__blend_avx2(const gsf__tile* tile, gsf__tile_state* state, int flags) {
     if (flags & GSF__WITH_DEPTH) gsf__blend_avx2_body(tile, state, 1);
     else gsf__blend_avx2_body(tile, state, 0);
+}
+
+enum { GSF__BLOCKS = GSF__TILE_PIXELS / 16 }; // block b: 4 x 4 pixels from index 16 b on, strip b >> 2
+
+// A bit per block that the ellipse overlaps, in the order of the rows: bit 4 * (row / 4) + strip.
+GSF__INLINE_AVX512 uint32_t gsf__blocks_avx512(const gsf__record* rec, float u, float v) {
+    const __m512 row = _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), zero = _mm512_setzero_ps();
+    const __m512 first = _mm512_setr_ps(0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12);
+    const __m512 dy = _mm512_sub_ps(row, _mm512_set1_ps(v));
+    const __m512 half2 = _mm512_fnmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->h1), dy), dy, _mm512_set1_ps(rec->h0));
+    const __m512 c = _mm512_fmadd_ps(_mm512_set1_ps(rec->kx), dy, _mm512_set1_ps(u));
+    const __m512 wide = _mm512_add_ps(_mm512_sqrt_ps(_mm512_max_ps(half2, zero)), _mm512_set1_ps(0.02f));
+    const __m512 half = _mm512_mask_blend_ps(_mm512_cmp_ps_mask(half2, zero, _CMP_GE_OQ), _mm512_set1_ps(-1e30f), wide);
+    __m512 from = _mm512_sub_ps(c, half), to = _mm512_add_ps(c, half); // then the union over the rows of a block
+    from = _mm512_min_ps(from, _mm512_shuffle_ps(from, from, 0xb1));
+    to = _mm512_max_ps(to, _mm512_shuffle_ps(to, to, 0xb1));
+    from = _mm512_min_ps(from, _mm512_shuffle_ps(from, from, 0x4e));
+    to = _mm512_max_ps(to, _mm512_shuffle_ps(to, to, 0x4e));
+    const __mmask16 starts = _mm512_cmp_ps_mask(from, _mm512_add_ps(first, _mm512_set1_ps(3.0f)), _CMP_LE_OQ);
+    return _mm512_mask_cmp_ps_mask(starts, to, first, _CMP_GE_OQ);
+}
+
+GSF__INLINE_AVX512 __m512 gsf__alpha_avx512(const gsf__record* rec, float u, float v, size_t b) {
+    const __m512 dy = _mm512_sub_ps(_mm512_loadu_ps(gsf__rows_of + 16 * (b & 3)), _mm512_set1_ps(v));
+    const __m512 center = _mm512_fmadd_ps(_mm512_set1_ps(rec->kx), dy, _mm512_set1_ps(u));
+    const __m512 e = _mm512_sub_ps(_mm512_loadu_ps(gsf__columns_of + 16 * (b >> 2)), center);
+    const __m512 exponent = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->yy), dy), dy, _mm512_set1_ps(rec->log2_opacity));
+    const __m512 x = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->ee), e), e, exponent);
+    const __mmask16 seen = _mm512_cmp_ps_mask(x, _mm512_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
+    const __m512 k = gsf__v_round_avx512(x), f = _mm512_sub_ps(x, k);
+    __m512 p = _mm512_set1_ps(1.3276404e-3f); // as in gsf__exp2_avx2
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(9.6755413e-3f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(5.5507135e-2f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(0.24022120f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(0.69314694f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(1.0000001f));
+    return gsf__v_keep_avx512(seen, gsf__v_scale2_avx512(p, k));
+}
+
+// Like gsf__batch_avx2, for blocks; bits of `live` are in the order of gsf__blocks_avx512.
+GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first, size_t end, uint32_t live,
+                                            gsf__batch* batch) {
+    const __m512i blocks = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+    size_t count = 0;
+    for (size_t i = first; i < end; i++) {
+        const size_t at = i - first;
+        const gsf__record* rec = gsf__batch_entry(tile, i, at, batch);
+        const uint32_t mask = gsf__blocks_avx512(rec, batch->u[at], batch->v[at]) & live;
+        const __m512i items = _mm512_or_si512(blocks, _mm512_set1_epi32((int)at << 8));
+        _mm512_storeu_si512(batch->items + count, _mm512_maskz_compress_epi32((__mmask16)mask, items));
+        count += (size_t)__builtin_popcount(mask);
+    }
+    for (size_t k = 0; k < count; k++) {
+        const size_t at = batch->items[k] >> 8;
+        _mm512_storeu_ps(batch->raw + 16 * k,
+                         gsf__alpha_avx512(batch->rec[at], batch->u[at], batch->v[at], batch->items[k] & 255u));
+    }
+    return count;
+}
+
+// As gsf__next_avx2.
+GSF__INLINE_AVX512 __m512 gsf__next_avx512(__m512 T, __m512 alpha, __m512* weight, __mmask16* shown) {
+    const __m512 open = _mm512_max_ps(T, _mm512_setzero_ps()), next = _mm512_fnmadd_ps(open, alpha, T);
+    *shown = _mm512_cmp_ps_mask(next, _mm512_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
+    *weight = _mm512_maskz_mul_ps(*shown, open, alpha);
+    return _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), *shown, next);
+}
+
+GSF__INLINE_AVX512 uint32_t gsf__live_avx512(const float* T) {
+    uint32_t live = 0;
+    for (uint32_t b = 0; b < GSF__BLOCKS; b++) {
+        const __mmask16 open = _mm512_cmp_ps_mask(_mm512_loadu_ps(T + 16 * b), _mm512_setzero_ps(), _CMP_GT_OQ);
+        live |= (uint32_t)(open != 0) << (4 * (b & 3) + (b >> 2));
+    }
+    return live;
+}
+
+// As gsf__blend_avx2_body, with a block in place of a step.
+GSF__INLINE_AVX512 void gsf__blend_avx512_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
+    gsf__batch batch;
+    uint32_t live = gsf__live_avx512(state->T);
+    for (size_t i = 0, end; i < tile->count && live; i = end, live = gsf__live_avx512(state->T)) {
+        end = i + GSF__AHEAD < tile->count ? i + GSF__AHEAD : tile->count;
+        const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
+        for (size_t k = 0; k < count; k++) {
+            const size_t at = 16 * (batch.items[k] & 255u);
+            const gsf__record* rec = batch.rec[batch.items[k] >> 8];
+            const __m512 alpha = _mm512_min_ps(_mm512_loadu_ps(batch.raw + 16 * k), _mm512_set1_ps(GSF__ALPHA_MAX));
+            __m512 w;
+            __mmask16 shown;
+            _mm512_storeu_ps(state->T + at, gsf__next_avx512(_mm512_loadu_ps(state->T + at), alpha, &w, &shown));
+            _mm512_storeu_ps(state->r + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->r), _mm512_loadu_ps(state->r + at)));
+            _mm512_storeu_ps(state->g + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->g), _mm512_loadu_ps(state->g + at)));
+            _mm512_storeu_ps(state->b + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->b), _mm512_loadu_ps(state->b + at)));
+            if (with_depth)
+                _mm512_storeu_ps(state->z + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->depth),
+                                                                _mm512_loadu_ps(state->z + at)));
+        }
+    }
+}
+
+GSF__TARGET_AVX512 static void gsf__blend_avx512(const gsf__tile* tile, gsf__tile_state* state, int flags) {
+    if (flags & GSF__WITH_DEPTH) gsf__blend_avx512_body(tile, state, 1);
+    else gsf__blend_avx512_body(tile, state, 0);
 }
 
 #endif // GSF__X86
@@ -7785,12 +7951,14 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
-            const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
+            const int s = gsf__lowest_bit(m);
             int open = 0, any = 0;
             for (int lane = 0; lane < 8; lane++) {
                 float* t = T + 8 * s + lane;
+                const int row = gsf__step_row(s, lane);
+                const float column = (float)gsf__step_column(s, lane);
                 steps[kept].T[lane] = *t > 0.0f ? *t : 0.0f;
-                const float raw = gsf__blend_pixel(rec, (float)(column + lane), center[row], exponent[row], t);
+                const float raw = gsf__blend_pixel(rec, column, center[row], exponent[row], t);
                 steps[kept].alpha[lane] = raw;
                 any |= raw > 0.0f;
                 open |= *t > 0.0f;
@@ -7823,12 +7991,12 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
             const gsf__step* step = steps + k - 1;
             const int s = (int)heads[k - 1].step;
-            const float dy = (float)(s & 15) - v, center = u + rec->kx * dy;
             for (int lane = 0; lane < 8; lane++) {
                 const float raw = step->alpha[lane];
                 if (!(raw > 0.0f)) continue;
                 const int at = 8 * s + lane;
-                const float e = (float)(8 * (s >> 4) + lane) - center;
+                const float dy = (float)gsf__step_row(s, lane) - v, center = u + rec->kx * dy;
+                const float e = (float)gsf__step_column(s, lane) - center;
                 const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX, w = alpha * step->T[lane];
                 float F = rec->r * gradient->r[at] + rec->g * gradient->g[at] + rec->b * gradient->b[at];
                 if (flags & GSF__WITH_DEPTH) F += rec->depth * gradient->z[at] + gradient->a[at];
@@ -7860,36 +8028,51 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
 
 GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
                                               gsf__step* steps, gsf__step_head* heads, size_t* step_count) {
-    const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
-    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
-    uint32_t live = gsf__live_steps(T_tile);
-    gsf__row_tests tests;
-    float raws[GSF__TILE_PIXELS];
+    gsf__batch batch;
+    uint32_t live = gsf__live_avx2(T_tile);
     size_t kept = 0, i = first;
-    for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
-        gsf__rows_ahead_avx2(tile, first, i, &tests);
-        const size_t at_test = i % GSF__AHEAD;
-        const uint32_t mask = tests.mask[at_test] & live;
-        gsf__alphas_avx2(rec, tests.center[at_test], tests.exponent[at_test], mask, raws);
-        for (uint32_t m = mask; m; m &= m - 1) {
-            const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
-            const __m256 T = _mm256_loadu_ps(T_tile + at), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
-            const __m256 raw = _mm256_and_ps(open, _mm256_loadu_ps(raws + at));
-            const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, alpha_max), T);
-            const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
-            __m256 T_new = next, alpha = raw;
-            if (_mm256_movemask_ps(stop)) { // a pixel finishes in front of this splat
-                T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
-                alpha = _mm256_andnot_ps(stop, raw);
-                if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
-            }
-            _mm256_storeu_ps(T_tile + at, T_new);
-            _mm256_storeu_ps(steps[kept].alpha, alpha);
+    for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end, live = gsf__live_avx2(T_tile)) {
+        end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
+        const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
+        for (size_t k = 0; k < count; k++) {
+            const uint32_t s = batch.items[k] & 255u;
+            const __m256 T = _mm256_loadu_ps(T_tile + 8 * s), raw = _mm256_loadu_ps(batch.raw + 8 * k);
+            __m256 weight, shown;
+            _mm256_storeu_ps(T_tile + 8 * s,
+                             gsf__next_avx2(T, _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), &weight, &shown));
+            const __m256 kept_alpha = _mm256_and_ps(shown, raw);
+            _mm256_storeu_ps(steps[kept].alpha, kept_alpha);
             _mm256_storeu_ps(steps[kept].T, T);
-            heads[kept].entry = (uint32_t)i;
-            heads[kept].step = (uint32_t)s;
-            kept += _mm256_movemask_ps(_mm256_cmp_ps(raw, zero, _CMP_GT_OQ)) != 0;
+            heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
+            heads[kept].step = s;
+            kept += !_mm256_testz_si256(_mm256_castps_si256(kept_alpha), _mm256_castps_si256(kept_alpha));
+        }
+    }
+    *step_count = kept;
+    return live && i < last ? i : tile->count;
+}
+
+GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
+                                                  gsf__step* memory, gsf__step_head* heads, size_t* step_count) {
+    gsf__wide_step* steps = (gsf__wide_step*)(void*)memory;
+    gsf__batch batch;
+    uint32_t live = gsf__live_avx512(T_tile);
+    size_t kept = 0, i = first;
+    for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end, live = gsf__live_avx512(T_tile)) {
+        end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
+        const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
+        for (size_t k = 0; k < count; k++) {
+            const uint32_t b = batch.items[k] & 255u;
+            const __m512 T = _mm512_loadu_ps(T_tile + 16 * b), raw = _mm512_loadu_ps(batch.raw + 16 * k);
+            __m512 weight;
+            __mmask16 shown;
+            _mm512_storeu_ps(T_tile + 16 * b,
+                             gsf__next_avx512(T, _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), &weight, &shown));
+            _mm512_storeu_ps(steps[kept].alpha, _mm512_maskz_mov_ps(shown, raw));
+            _mm512_storeu_ps(steps[kept].T, T);
+            heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
+            heads[kept].step = b;
+            kept += _mm512_mask_cmp_ps_mask(shown, raw, _mm512_setzero_ps(), _CMP_GT_OQ) != 0;
         }
     }
     *step_count = kept;
@@ -7912,28 +8095,21 @@ GSF__TARGET_AVX2 static inline __m128 gsf__sum4_avx2(__m256 a, __m256 b, __m256 
 GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
                                              size_t step_count, gsf__tile_gradient* gradient, float* slots,
                                              uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
-    float center[GSF__STEPS], below[GSF__STEPS]; // per step: centre as in gsf__rows_avx2; dy
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->pairs[entry].splat;
         const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
-        for (int h = 0; h < 2; h++) {
-            const __m256 dy = _mm256_sub_ps(_mm256_add_ps(lanes, _mm256_set1_ps(8.0f * (float)h)), v);
-            const __m256 c = _mm256_fmadd_ps(_mm256_set1_ps(rec->kx), dy, u);
-            _mm256_storeu_ps(below + 8 * h, dy);
-            _mm256_storeu_ps(below + 16 + 8 * h, dy);
-            _mm256_storeu_ps(center + 8 * h, c);
-            _mm256_storeu_ps(center + 16 + 8 * h, _mm256_sub_ps(c, _mm256_set1_ps(8.0f)));
-        }
+        const __m256 kx = _mm256_set1_ps(rec->kx);
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         __m256 sp = _mm256_setzero_ps(), se = sp, see = sp, sy = sp, sey = sp, syy = sp, sr = sp, sg = sp, sb = sp, sz = sp;
         __m256 sax = sp, say = sp;
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
             const gsf__step* step = steps + k - 1;
             const size_t s = heads[k - 1].step, at = 8 * s;
-            const __m256 dy = _mm256_broadcast_ss(below + s), e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
+            const __m256 dy = _mm256_sub_ps(_mm256_loadu_ps(gsf__rows_of + 8 * (s & 7)), v);
+            const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(gsf__columns_of + 16 * (s >> 3)), _mm256_fmadd_ps(kx, dy, u));
             const __m256 raw = _mm256_loadu_ps(step->alpha), T = _mm256_loadu_ps(step->T);
             const __m256 gr = _mm256_loadu_ps(gradient->r + at), gg = _mm256_loadu_ps(gradient->g + at);
             const __m256 gb = _mm256_loadu_ps(gradient->b + at), behind = _mm256_loadu_ps(gradient->behind + at);
@@ -7987,11 +8163,98 @@ GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf_
         gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
 }
 
+// Horizontal sums of twelve vectors, in the first twelve lanes of the result.
+GSF__INLINE_AVX512 __m512 gsf__sum12_avx512(const __m512 v[12]) {
+    __m512 pair[6], four[3];
+    for (int i = 0; i < 6; i++) // halves of 2 i, then of 2 i + 1
+        pair[i] = _mm512_add_ps(_mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0x44),
+                                _mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0xee));
+    for (int i = 0; i < 3; i++) // a quarter of each of 4 i .. 4 i + 3
+        four[i] = _mm512_add_ps(_mm512_shuffle_f32x4(pair[2 * i], pair[2 * i + 1], 0x88),
+                                _mm512_shuffle_f32x4(pair[2 * i], pair[2 * i + 1], 0xdd));
+    const __m512 p = _mm512_add_ps(_mm512_unpacklo_ps(four[0], four[1]), _mm512_unpackhi_ps(four[0], four[1]));
+    const __m512 q = _mm512_add_ps(_mm512_unpacklo_ps(four[2], four[2]), _mm512_unpackhi_ps(four[2], four[2]));
+    const __m512 sums = _mm512_add_ps(_mm512_shuffle_ps(p, q, 0x44), _mm512_shuffle_ps(p, q, 0xee)); // 0 4 8 8, 1 5 9 9, ...
+    const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 3, 3, 3);
+    return _mm512_permutexvar_ps(order, sums);
+}
+
+GSF__INLINE_AVX512 void gsf__reverse_avx512_body(const gsf__tile* tile, const gsf__step* memory,
+                                                 const gsf__step_head* heads, size_t step_count,
+                                                 gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used,
+                                                 int with_depth, int straight_through, int with_abs) {
+    const __m512 alpha_max = _mm512_set1_ps(GSF__ALPHA_MAX), zero = _mm512_setzero_ps();
+    const gsf__wide_step* steps = (const gsf__wide_step*)(const void*)memory;
+    for (size_t k = step_count; k > 0;) {
+        const uint32_t entry = heads[k - 1].entry;
+        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const __m512 u = _mm512_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm512_set1_ps(rec->v - tile->y0 + rec->v_low);
+        const __m512 kx = _mm512_set1_ps(rec->kx);
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        __m512 sp = zero, se = zero, see = zero, sy = zero, sey = zero, syy = zero, sr = zero, sg = zero, sb = zero;
+        __m512 sz = zero, sax = zero, say = zero;
+        for (; k > 0 && heads[k - 1].entry == entry; k--) {
+            const gsf__wide_step* step = steps + k - 1;
+            const size_t b = heads[k - 1].step, at = 16 * b;
+            const __m512 dy = _mm512_sub_ps(_mm512_loadu_ps(gsf__rows_of + 16 * (b & 3)), v);
+            const __m512 e = _mm512_sub_ps(_mm512_loadu_ps(gsf__columns_of + 16 * (b >> 2)), _mm512_fmadd_ps(kx, dy, u));
+            const __m512 raw = _mm512_loadu_ps(step->alpha), T = _mm512_loadu_ps(step->T);
+            const __m512 gr = _mm512_loadu_ps(gradient->r + at), gg = _mm512_loadu_ps(gradient->g + at);
+            const __m512 gb = _mm512_loadu_ps(gradient->b + at), behind = _mm512_loadu_ps(gradient->behind + at);
+            const __m512 alpha = _mm512_min_ps(raw, alpha_max), w = _mm512_mul_ps(alpha, T);
+            __m512 F = _mm512_fmsub_ps(_mm512_set1_ps(rec->r), gr, behind);
+            F = _mm512_fmadd_ps(_mm512_set1_ps(rec->g), gg, F);
+            F = _mm512_fmadd_ps(_mm512_set1_ps(rec->b), gb, F);
+            if (with_depth) {
+                const __m512 gz = _mm512_loadu_ps(gradient->z + at);
+                F = _mm512_add_ps(_mm512_fmadd_ps(_mm512_set1_ps(rec->depth), gz, F), _mm512_loadu_ps(gradient->a + at));
+                sz = _mm512_fmadd_ps(w, gz, sz);
+            }
+            _mm512_storeu_ps(gradient->behind + at, _mm512_fmadd_ps(alpha, F, behind));
+            __m512 p = _mm512_mul_ps(_mm512_mul_ps(T, raw), F);
+            if (!straight_through) p = _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(raw, alpha_max, _CMP_LE_OQ), p);
+            const __m512 pe = _mm512_mul_ps(p, e), py = _mm512_mul_ps(p, dy);
+            sp = _mm512_add_ps(sp, p);
+            se = _mm512_add_ps(se, pe);
+            see = _mm512_fmadd_ps(pe, e, see);
+            sy = _mm512_add_ps(sy, py);
+            sey = _mm512_fmadd_ps(pe, dy, sey);
+            syy = _mm512_fmadd_ps(py, dy, syy);
+            sr = _mm512_fmadd_ps(w, gr, sr);
+            sg = _mm512_fmadd_ps(w, gg, sg);
+            sb = _mm512_fmadd_ps(w, gb, sb);
+            if (with_abs) {
+                const __m512 dv = _mm512_fmadd_ps(_mm512_set1_ps(conic_b), pe, _mm512_mul_ps(_mm512_set1_ps(conic_q), py));
+                sax = _mm512_add_ps(sax, _mm512_abs_ps(pe));
+                say = _mm512_add_ps(say, _mm512_abs_ps(dv));
+            }
+        }
+        const __m512 parts[12] = {sp, se, see, sy, sey, syy, sr, sg, sb, sz, _mm512_mul_ps(sax, _mm512_set1_ps(conic_a)), say};
+        const size_t slot = tile->pairs[entry].slot;
+        // complete: an entry's steps are all in one bucket
+        _mm512_mask_storeu_ps(slots + GSF__SLOT_FLOATS * slot, 0x0fff, gsf__sum12_avx512(parts));
+        slot_used[slot] = 1;
+    }
+}
+
+GSF__TARGET_AVX512 static void gsf__reverse_avx512(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                                   size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                                   uint8_t* slot_used, int flags) {
+    if (flags == 0)
+        gsf__reverse_avx512_body(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0, 0);
+    else if (flags == GSF__WITH_DEPTH)
+        gsf__reverse_avx512_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 0);
+    else if (flags & GSF__STRAIGHT_THROUGH)
+        gsf__reverse_avx512_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1, 1);
+    else
+        gsf__reverse_avx512_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
+}
+
 #endif // GSF__X86
 
 static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
-    const gsf__raster_kernels kernels = {GSF__KERNEL_OF(level, gsf__blend), GSF__KERNEL_OF(level, gsf__keep),
-                                         GSF__KERNEL_OF(level, gsf__reverse)};
+    const gsf__raster_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__blend), GSF__WIDE_KERNEL_OF(level, gsf__keep),
+                                         GSF__WIDE_KERNEL_OF(level, gsf__reverse)};
     return kernels;
 }
 
@@ -8326,18 +8589,21 @@ static void gsf__tile_extent(const gsf_rasterizer* r, const gsf__tile* tile, int
     *rows = r->height - (int)tile->y0 < GSF__TILE ? r->height - (int)tile->y0 : GSF__TILE;
 }
 
-// Number of pixels of step s that lie inside the image, 0..8.
-static int gsf__step_width(int s, int columns, int rows) {
-    const int left = columns - 8 * (s >> 4);
-    return (s & 15) >= rows || left <= 0 ? 0 : left < 8 ? left : 8;
+// Index in the arrays of a tile of the first pixel of row y in strip k; the next pixels of the row follow at distance 2.
+static int gsf__strip_pixel(int k, int y) { return GSF__STRIP * GSF__TILE * k + 8 * (y / 2) + y % 2; }
+
+// Number of pixels of a row of strip k that lie inside the image, 0..4.
+static int gsf__strip_width(int k, int columns) {
+    const int left = columns - GSF__STRIP * k;
+    return left <= 0 ? 0 : left < GSF__STRIP ? left : GSF__STRIP;
 }
 
 // T = 1 inside the image, -1 (finished) outside.
 static void gsf__open_tile(float* T, int columns, int rows) {
-    for (int s = 0; s < GSF__STEPS; s++) {
-        const int width = gsf__step_width(s, columns, rows);
-        for (int lane = 0; lane < 8; lane++) T[8 * s + lane] = lane < width ? 1.0f : -1.0f;
-    }
+    for (int i = 0; i < GSF__TILE_PIXELS; i++) T[i] = 1.0f;
+    for (int y = 0; y < GSF__TILE && (columns < GSF__TILE || rows < GSF__TILE); y++)
+        for (int x = y < rows ? columns : 0; x < GSF__TILE; x++)
+            T[gsf__strip_pixel(x / GSF__STRIP, y) + 2 * (x % GSF__STRIP)] = -1.0f;
 }
 
 static void gsf__put_pixel(const gsf_image* image, int64_t x, int64_t y, int channel, float value) {
@@ -8350,6 +8616,18 @@ static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int ch
     memcpy(&value, (const char*)image->data + y * image->stride_y + x * image->stride_x + channel * image->stride_c,
            sizeof value);
     return value;
+}
+
+// The colours of `width` pixels of a row in a strip, over the background, and their T.
+static inline void gsf__row_colors(const gsf__tile_state* state, int at, int width, const float background[3], float* rgb,
+                                   float* T) {
+    for (int i = 0; i < width; i++) {
+        const int k = at + 2 * i;
+        T[i] = fabsf(state->T[k]);
+        rgb[3 * i] = state->r[k] + T[i] * background[0];
+        rgb[3 * i + 1] = state->g[k] + T[i] * background[1];
+        rgb[3 * i + 2] = state->b[k] + T[i] * background[2];
+    }
 }
 
 static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
@@ -8365,29 +8643,26 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     job->kernels.blend(&tile, &state, job->flags);
     const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
     const int packed = color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float);
-    const float* background = job->view->background;
-    for (int s = 0; s < GSF__STEPS; s++) {
-        const int width = gsf__step_width(s, columns, rows);
-        const int64_t x = (int64_t)tile.x0 + 8 * (s >> 4), y = (int64_t)tile.y0 + (s & 15);
+    for (int q = 0; q < GSF__TILE / GSF__STRIP * rows; q++) {
+        const int strip = q % (GSF__TILE / GSF__STRIP), row = q / (GSF__TILE / GSF__STRIP);
+        const int width = gsf__strip_width(strip, columns), at = gsf__strip_pixel(strip, row);
+        const int64_t x = (int64_t)tile.x0 + GSF__STRIP * strip, y = (int64_t)tile.y0 + row;
         const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
-        float rgb[3 * 8], T[8];
-        for (int lane = 0; lane < width; lane++) {
-            const int k = 8 * s + lane;
-            T[lane] = fabsf(state.T[k]);
-            rgb[3 * lane] = state.r[k] + T[lane] * background[0];
-            rgb[3 * lane + 1] = state.g[k] + T[lane] * background[1];
-            rgb[3 * lane + 2] = state.b[k] + T[lane] * background[2];
+        float rgb[3 * GSF__STRIP], T[GSF__STRIP];
+        if (width == GSF__STRIP && packed && color->data) { // most rows: loops and copies of constant length
+            gsf__row_colors(&state, at, GSF__STRIP, job->view->background, rgb, T);
+            memcpy(r->final_T + pixel, T, sizeof T);
+            memcpy((char*)color->data + y * color->stride_y + x * color->stride_x, rgb, sizeof rgb);
+        } else {
+            gsf__row_colors(&state, at, width, job->view->background, rgb, T);
+            if (width) memcpy(r->final_T + pixel, T, (size_t)width * sizeof(float));
+            for (int k = 0; k < 3 * width && color->data; k++) gsf__put_pixel(color, x + k / 3, y, k % 3, rgb[k]);
         }
-        memcpy(r->final_T + pixel, T, (size_t)width * sizeof(float));
-        if (color->data && packed)
-            memcpy((char*)color->data + y * color->stride_y + x * color->stride_x, rgb, 3 * (size_t)width * sizeof(float));
-        else if (color->data)
-            for (int k = 0; k < 3 * width; k++) gsf__put_pixel(color, x + k / 3, y, k % 3, rgb[k]);
-        if (r->has_depth) memcpy(r->depth_sum + pixel, state.z + 8 * s, (size_t)width * sizeof(float));
+        for (int lane = 0; lane < width && r->has_depth; lane++) r->depth_sum[pixel + (size_t)lane] = state.z[at + 2 * lane];
         for (int lane = 0; lane < width && (alpha->data || depth->data); lane++) {
-            const float a = 1.0f - T[lane];
+            const float a = 1.0f - T[lane], z = state.z[at + 2 * lane];
             if (alpha->data) gsf__put_pixel(alpha, x + lane, y, 0, a);
-            if (depth->data) gsf__put_pixel(depth, x + lane, y, 0, T[lane] < 1.0f ? state.z[8 * s + lane] / a : 0.0f);
+            if (depth->data) gsf__put_pixel(depth, x + lane, y, 0, T[lane] < 1.0f ? z / a : 0.0f);
         }
     }
 }
@@ -8427,36 +8702,46 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     return GSF_OK;
 }
 
+// Gradients of the colours of `width` pixels of a row in a strip.
+static inline void gsf__row_gradient(const float* d_color, int at, int width, const float background[3],
+                                     gsf__tile_gradient* gradient) {
+    for (int i = 0; i < width; i++) {
+        const float* d = d_color + 3 * i;
+        const int k = at + 2 * i;
+        gradient->r[k] = d[0];
+        gradient->g[k] = d[1];
+        gradient->b[k] = d[2];
+        gradient->behind[k] = d[0] * background[0] + d[1] * background[1] + d[2] * background[2];
+    }
+}
+
 static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile* tile, int columns, int rows,
                                     gsf__tile_gradient* gradient, double background[3]) {
     const gsf_rasterizer* r = job->r;
-    const float* shown = job->view->background;
     memset(gradient, 0, sizeof *gradient);
-    for (int s = 0; s < GSF__STEPS; s++) {
-        const int width = gsf__step_width(s, columns, rows);
-        const int x = (int)tile->x0 + 8 * (s >> 4), y = (int)tile->y0 + (s & 15);
-        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
-        for (int lane = 0; lane < width && job->d_color; lane++) {
-            const float* d = job->d_color + 3 * (pixel + (size_t)lane);
-            const int k = 8 * s + lane;
-            gradient->r[k] = d[0];
-            gradient->g[k] = d[1];
-            gradient->b[k] = d[2];
-            gradient->behind[k] = d[0] * shown[0] + d[1] * shown[1] + d[2] * shown[2];
-        }
+    for (int q = 0; q < GSF__TILE / GSF__STRIP * rows; q++) {
+        const int strip = q % (GSF__TILE / GSF__STRIP), row = q / (GSF__TILE / GSF__STRIP);
+        const int width = gsf__strip_width(strip, columns), first = gsf__strip_pixel(strip, row);
+        const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)((int)tile->x0 + GSF__STRIP * strip);
+        if (job->d_color && width == GSF__STRIP)
+            gsf__row_gradient(job->d_color + 3 * pixel, first, GSF__STRIP, job->view->background, gradient);
+        else if (job->d_color)
+            gsf__row_gradient(job->d_color + 3 * pixel, first, width, job->view->background, gradient);
         for (int lane = 0; lane < width && job->wants_background; lane++) {
             const float T = r->final_T[pixel + (size_t)lane];
-            background[0] += (double)(T * gradient->r[8 * s + lane]);
-            background[1] += (double)(T * gradient->g[8 * s + lane]);
-            background[2] += (double)(T * gradient->b[8 * s + lane]);
+            background[0] += (double)(T * gradient->r[first + 2 * lane]);
+            background[1] += (double)(T * gradient->g[first + 2 * lane]);
+            background[2] += (double)(T * gradient->b[first + 2 * lane]);
         }
-        for (int lane = 0; lane < width && job->d_alpha; lane++) gradient->a[8 * s + lane] = job->d_alpha[pixel + (size_t)lane];
+        for (int lane = 0; lane < width && job->d_alpha; lane++)
+            gradient->a[first + 2 * lane] = job->d_alpha[pixel + (size_t)lane];
         for (int lane = 0; lane < width && job->d_depth; lane++) { // depth = D / A
             const size_t at = pixel + (size_t)lane;
             const float weight = 1.0f - r->final_T[at];
+            const int k = first + 2 * lane;
             if (!(weight > 0.0f)) continue;
-            gradient->z[8 * s + lane] = job->d_depth[at] / weight;
-            gradient->a[8 * s + lane] -= gradient->z[8 * s + lane] * (r->depth_sum[at] / weight);
+            gradient->z[k] = job->d_depth[at] / weight;
+            gradient->a[k] -= gradient->z[k] * (r->depth_sum[at] / weight);
         }
     }
 }
@@ -8470,7 +8755,7 @@ static void gsf__reverse_chunk(void* arg, size_t index, int32_t worker) {
     double* background = r->tile_background + 3 * index;
     gsf__worker_scratch* scratch = r->workers + worker;
     gsf__tile_gradient gradient;
-    float T[GSF__TILE_PIXELS];
+    GSF__LINES float T[GSF__TILE_PIXELS];
     int columns, rows;
     memset(background, 0, 3 * sizeof(double));
     gsf__tile_extent(r, &tile, &columns, &rows);
@@ -8507,8 +8792,8 @@ static gsf_result gsf__reserve_workers(gsf_context* ctx, gsf_rasterizer* r, size
     r->workers = (gsf__worker_scratch*)gsf__arena_alloc(arena, (size_t)count, sizeof(gsf__worker_scratch));
     for (int i = 0; r->workers && i < count; i++) {
         gsf__worker_scratch* w = r->workers + i;
-        w->steps = (gsf__step*)gsf__arena_alloc(arena, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step));
-        w->heads = (gsf__step_head*)gsf__arena_alloc(arena, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step_head));
+        w->steps = (gsf__step*)gsf__arena_alloc(arena, GSF__KEPT_MOST, sizeof(gsf__step));
+        w->heads = (gsf__step_head*)gsf__arena_alloc(arena, GSF__KEPT_MOST, sizeof(gsf__step_head));
         w->checkpoints = (float*)gsf__arena_alloc(arena, r->checkpoint_capacity, GSF__TILE_PIXELS * sizeof(float));
         w->checkpoint_entry = (uint32_t*)gsf__arena_alloc(arena, r->checkpoint_capacity, sizeof(uint32_t));
     }
@@ -8592,7 +8877,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 //     a = (1 - q) (D - p mu) / B1 + (S - k z) e_s - (D - c - k D) e_d
 // and the gradient at pixel i is 1/4 d(1 - SSIM)/dx(i) = G*a + (d(i) - c) G*e_d - s(i) G*e_s.
 //
-// Images stay interleaved: a row is 3W floats, padded to a multiple of 8, and horizontal taps are 3 floats apart. Rows
+// Images stay interleaved: a row is 3W floats, padded to a multiple of 16, and horizontal taps are 3 floats apart. Rows
 // are processed in groups of four, which share the loads of their vertical sums. Each worker streams a band of rows
 // through two ring buffers:
 //     images   s, d, s^2, (d - c)^2                         5 groups, starting at row first - 10 of the band
@@ -8656,6 +8941,7 @@ static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) 
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_LOSS
+#define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_LOSS
 
@@ -8803,13 +9089,34 @@ GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, flo
     }
 #undef GSF__LOSS_EIGHT
 }
+#undef GSF__LOSS_BETWEEN
+
+// Sixteen consecutive floats that start `by` (1..15) floats after those of `low`; `high` starts 16 floats after `low`.
+#define GSF__LOSS_BETWEEN(low, high, by) _mm512_castsi512_ps(_mm512_alignr_epi32(high, low, by))
+
+GSF__TARGET_AVX512 static void gsf__loss_across_avx512(const float* v, size_t n, float* sums) {
+    const __m512 middle = _mm512_set1_ps(gsf__loss_window[0]);
+    __m512i m16 = _mm512_loadu_si512(v - 16), p0 = _mm512_loadu_si512(v);
+    for (size_t i = 0; i < n; i += 16) {
+        const __m512i p16 = _mm512_loadu_si512(v + i + 16);
+        __m512 s = _mm512_mul_ps(middle, _mm512_castsi512_ps(p0));
+        s = gsf__loss_taps_avx512(1, GSF__LOSS_BETWEEN(m16, p0, 13), GSF__LOSS_BETWEEN(p0, p16, 3), s);
+        s = gsf__loss_taps_avx512(2, GSF__LOSS_BETWEEN(m16, p0, 10), GSF__LOSS_BETWEEN(p0, p16, 6), s);
+        s = gsf__loss_taps_avx512(3, GSF__LOSS_BETWEEN(m16, p0, 7), GSF__LOSS_BETWEEN(p0, p16, 9), s);
+        s = gsf__loss_taps_avx512(4, GSF__LOSS_BETWEEN(m16, p0, 4), GSF__LOSS_BETWEEN(p0, p16, 12), s);
+        s = gsf__loss_taps_avx512(5, GSF__LOSS_BETWEEN(m16, p0, 1), GSF__LOSS_BETWEEN(p0, p16, 15), s);
+        _mm512_storeu_ps(sums + i, s);
+        m16 = p0, p0 = p16;
+    }
+}
+#undef GSF__LOSS_BETWEEN
 
 #endif
 
 static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
-    const gsf__loss_kernels kernels = {GSF__KERNEL_OF(level, gsf__loss_load), GSF__KERNEL_OF(level, gsf__loss_down),
-                                       GSF__KERNEL_OF(level, gsf__loss_across), GSF__KERNEL_OF(level, gsf__loss_map),
-                                       GSF__KERNEL_OF(level, gsf__loss_gradient)};
+    const gsf__loss_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__loss_load), GSF__WIDE_KERNEL_OF(level, gsf__loss_down),
+                                       GSF__WIDE_KERNEL_OF(level, gsf__loss_across), GSF__WIDE_KERNEL_OF(level, gsf__loss_map),
+                                       GSF__WIDE_KERNEL_OF(level, gsf__loss_gradient)};
     return kernels;
 }
 
@@ -8830,7 +9137,7 @@ typedef struct gsf__loss_buffers { // of a worker processing a band; pointers ar
     int32_t first, end;                                // rows of the band
 } gsf__loss_buffers;
 
-static size_t gsf__loss_padded(int32_t width) { return (3 * (size_t)width + 7) & ~(size_t)7; }
+static size_t gsf__loss_padded(int32_t width) { return (3 * (size_t)width + 15) & ~(size_t)15; }
 
 // Floats of a row with its margins: an odd number of cache lines, so that rows do not compete for the same cache sets.
 static size_t gsf__loss_row(int32_t width) {
@@ -9222,7 +9529,7 @@ static void gsf__model_columns(const gsf__model* model, gsf__column out[GSF__COL
 static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t needed) {
     if (needed <= model->capacity && model->block) return GSF_OK;
     if (needed > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "trainer: %zu splats are too many", needed);
-    size_t capacity = model->capacity + model->capacity / 2;
+    size_t capacity = model->capacity + model->capacity / 8; // a trainer grows at most once per densify_interval
     capacity = ((needed > capacity ? needed : capacity) + 64) & ~(size_t)63;
     gsf__model grown = *model;
     char* block = (char*)gsf_alloc_zeroed(ctx, gsf__model_layout(&grown, capacity, NULL), 1);
@@ -9263,7 +9570,7 @@ typedef struct gsf__adam_rates { // learning rates of one step
     double means, scales, quats, opacity, sh_dc, sh_rest;
 } gsf__adam_rates;
 
-enum { GSF__ADAM_PERIOD = 384 }; // the pattern of SH rates repeats after at most this many floats: 8 rows of (16,3)
+enum { GSF__ADAM_PERIOD = 768 }; // the pattern of SH rates repeats after at most this many floats: 16 rows of (16,3)
 
 typedef uint32_t (*gsf__adam_update_fn)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
                                         const float* rates, size_t period, float inv_correction2);
@@ -9288,7 +9595,7 @@ typedef struct gsf__adam_job {
     float inv_correction2;           // 1 / sqrt(1 - beta2^t)
     size_t active_sh;                // leading floats of an SH row that can have a gradient
     float rates[4];                  // learning rates of the groups before SH, divided by 1 - beta1^t
-    float sh_rates[GSF__ADAM_PERIOD]; // likewise of 8 SH rows
+    float sh_rates[GSF__ADAM_PERIOD]; // likewise of 16 SH rows
     gsf__adam_update_fn update;
 } gsf__adam_job;
 
@@ -9318,6 +9625,7 @@ static uint32_t gsf__count_bits(uint32_t bits) {
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_ADAM
+#define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_ADAM
 
@@ -9358,7 +9666,7 @@ GSF__V_INLINE uint32_t GSF__V(gsf__adam_vector)(float* value, float* m, float* v
     return (good_bits & finite_bits) == all ? 0 : gsf__count_bits(all & ~good_bits) + gsf__count_bits(all & ~finite_bits);
 }
 
-// Updates `rows` runs of n values each, which start `stride` apart. rates: `period` (a multiple of 8) step sizes,
+// Updates `rows` runs of n values each, which start `stride` apart. rates: `period` (a multiple of 16) step sizes,
 // repeated along each run. Non-finite gradients are treated as 0, and updates to a non-finite value are skipped.
 // Returns how many of both there were.
 GSF__V_KERNEL uint32_t GSF__V(gsf__adam_update)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride,
@@ -9412,8 +9720,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->model = model;
     lazy->active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
     for (int i = 0; i < 48; i++) lazy->rates[i] = (float)(i < 3 ? rates->sh_dc : rates->sh_rest);
-    lazy->update = GSF__KERNEL_OF(level, gsf__adam_update);
-    lazy->catch_up = GSF__KERNEL_OF(level, gsf__lazy_catch_up);
+    lazy->update = GSF__WIDE_KERNEL_OF(level, gsf__adam_update);
+    lazy->catch_up = GSF__WIDE_KERNEL_OF(level, gsf__lazy_catch_up);
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
     const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
     double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
@@ -9501,7 +9809,7 @@ static uint32_t gsf__adam_lazy_sh(const gsf__adam_job* job, size_t begin, size_t
         for (; b < blocks && rest[b] == GSF__AWAKE; b++) rest[b] = 0;
         const size_t at = from * width, rows = (b * GSF__BLOCK < end ? b * GSF__BLOCK : end) - from;
         rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, whole ? 1 : rows, width,
-                                whole ? rows * width : job->active_sh, job->sh_rates, 8 * width, job->inv_correction2);
+                                whole ? rows * width : job->active_sh, job->sh_rates, 16 * width, job->inv_correction2);
     }
     return rejected;
 }
@@ -9517,10 +9825,10 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
     for (int g = 0; g < GSF__GROUPS - (model->lazy != NULL); g++) {
         const gsf__group* group = &model->groups[g];
         const size_t width = group->width, at = begin * width;
-        float constant[8];
-        for (int i = 0; i < 8; i++) constant[i] = job->rates[g < GSF__SH ? g : 0];
+        float constant[16];
+        for (int i = 0; i < 16; i++) constant[i] = job->rates[g < GSF__SH ? g : 0];
         const float* rates = g == GSF__SH ? job->sh_rates : constant;
-        const size_t period = g == GSF__SH ? 8 * width : 8;
+        const size_t period = g == GSF__SH ? 16 * width : 16;
         if (g == GSF__SH && job->active_sh < width)
             rejected += job->update(group->value + at, group->m + at, group->v + at, group->grad + at, rows, width,
                                     job->active_sh, rates, period, job->inv_correction2);
@@ -9546,10 +9854,10 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     job.rates[GSF__QUATS] = (float)(rates->quats / correction1);
     job.rates[GSF__OPACITY] = (float)(rates->opacity / correction1);
     const size_t width = model->groups[GSF__SH].width;
-    for (size_t i = 0; i < 8 * width; i++)
+    for (size_t i = 0; i < 16 * width; i++)
         job.sh_rates[i] = (float)((i % width < 3 ? rates->sh_dc : rates->sh_rest) / correction1);
     job.active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
-    job.update = GSF__KERNEL_OF(ctx->cpu_level, gsf__adam_update);
+    job.update = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__adam_update);
     if (model->lazy) gsf__lazy_prepare(ctx->cpu_level, model->lazy, model, rates, t, sh_bands);
     const size_t chunks = gsf__model_chunks(model->count);
     gsf__parallel_for(ctx, chunks, gsf__adam_chunk, &job);
@@ -9578,12 +9886,17 @@ typedef struct gsf__densify_rule {
     const float* normals;  // (2, splits, 3) standard normal samples to use instead; NULL = draw them
 } gsf__densify_rule;
 
+static float gsf__densify_mean(float grad_sum, uint32_t visits) {
+    const float mean = visits ? grad_sum / (float)visits : 0.0f;
+    return mean <= FLT_MAX ? mean : 0.0f;
+}
+
 // The larger of the means over photos and over restored views. A common mean would let one kind dilute the other.
 static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
     float largest = 0.0f;
     for (int k = 0; k < 2; k++) {
-        const float mean = model->visits[k][i] ? model->grad_sum[k][i] / (float)model->visits[k][i] : 0.0f;
-        if (mean <= FLT_MAX && mean > largest) largest = mean;
+        const float mean = gsf__densify_mean(model->grad_sum[k][i], model->visits[k][i]);
+        if (mean > largest) largest = mean;
     }
     return largest;
 }
@@ -10404,6 +10717,29 @@ typedef struct gsf__visit_job {
     float half[2][2];        // half width and height of each
 } gsf__visit_job;
 
+// What the visit adds to the splat's gradient sum.
+static float gsf__visit_grad(const gsf__visit_job* job, int k, size_t i) {
+    const float* g = job->model->screen[k] + 2 * i;
+    const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
+    return norm <= FLT_MAX ? norm : 0.0f;
+}
+
+// The number of splats whose mean gradient will reach the threshold after the visit.
+static size_t gsf__visit_candidates(const gsf__visit_job* job, float threshold) {
+    const gsf__model* model = job->model;
+    size_t count = 0;
+    for (size_t i = 0; i < model->count; i++) {
+        int reached = 0;
+        for (int k = 0; k < 2; k++) {
+            const int seen = job->counts[k] && model->seen[k][i];
+            const float sum = seen ? model->grad_sum[k][i] + gsf__visit_grad(job, k, i) : model->grad_sum[k][i];
+            reached |= gsf__densify_mean(sum, model->visits[k][i] + (seen ? 1u : 0u)) >= threshold;
+        }
+        count += (size_t)reached;
+    }
+    return count;
+}
+
 static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__visit_job* job = (const gsf__visit_job*)arg;
     gsf__model* model = job->model;
@@ -10414,8 +10750,7 @@ static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
             float* g = model->screen[k] + 2 * i;
             if (model->seen[k][i]) {
-                const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
-                if (norm <= FLT_MAX) model->grad_sum[k][i] += norm;
+                model->grad_sum[k][i] += gsf__visit_grad(job, k, i);
                 model->visits[k][i]++;
             }
             g[0] = g[1] = 0.0f;
@@ -10675,10 +11010,10 @@ GSF_API gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer
     const int densify = iteration < d->densify_until && iteration > d->densify_from &&
                         iteration % d->densify_interval == 0;
     gsf_result result = gsf__trainer_gradients(ctx, trainer, iteration, &visits, &local);
-    if (result == GSF_OK && densify) { // reserve the worst case now: nothing may fail after Adam
+    if (result == GSF_OK && densify) { // reserve now: nothing may fail after Adam, which decides between clone and split
         const size_t room = d->max_splats > model->count ? d->max_splats - model->count : 0;
-        const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats)
-                                     : 2 * (room < model->count ? room : model->count);
+        const size_t found = d->mcmc ? 0 : gsf__visit_candidates(&visits, gsf__trainer_rule(trainer, iteration).grad);
+        const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats) : 2 * (room < found ? room : found);
         result = gsf__model_reserve(ctx, model, model->count + grown);
         gsf__trainer_refresh_view(trainer);
     }

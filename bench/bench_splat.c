@@ -110,7 +110,7 @@ static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     bench_count job;
     job.r = r;
-    job.kernels = gsf__raster_kernels_of(ctx->cpu_level);
+    job.kernels = gsf__raster_kernels_of(ctx->cpu_level > GSF_CPU_AVX2 ? GSF_CPU_AVX2 : ctx->cpu_level); // keep gsf__step
     job.pairs = (uint64_t*)gsf_alloc(ctx, tiles, sizeof(uint64_t));
     if (!job.pairs) exit(1);
     gsf__parallel_for(ctx, tiles, bench_count_tile, &job);
@@ -740,7 +740,7 @@ int main(int argc, char** argv) {
         bench_growth(&o);
         return 0;
     }
-    const gsf_cpu_level levels[] = {GSF_CPU_SCALAR, GSF_CPU_AVX2};
+    const gsf_cpu_level levels[] = {GSF_CPU_SCALAR, GSF_CPU_AVX2, GSF_CPU_AVX512};
     for (size_t k = 0; k < GSF__COUNT(levels); k++)
         for (int threads = 1; threads <= 2; threads++) bench_machine(&o, levels[k], threads);
     for (size_t k = 0; k < GSF__COUNT(levels); k++)

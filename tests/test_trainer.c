@@ -991,6 +991,37 @@ static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy(ctx, &start);
 }
 
+// The candidates that are counted before a visit, for which a step reserves memory, are those selected after it.
+static void test_candidates(gsf_context* ctx, const scene* s) {
+    gsf_trainer* trainer = make_busy(ctx, s, 0);
+    gsf__model* model = &trainer->model;
+    for (int i = 0; i < 9; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL));
+    gsf__densify_rule rule = gsf__trainer_rule(trainer, 10);
+    rule.max_splats = 3 * model->count;
+    float sum = 0.0f;
+    for (size_t i = 0; i < model->count; i++) sum += gsf__densify_mean_grad(model, i);
+    rule.grad = sum / (float)model->count; // some splats reach the mean, some do not
+    gsf__visit_job visits;
+    memset(&visits, 0, sizeof visits);
+    visits.model = model;
+    for (int k = 0; k < 2; k++) {
+        visits.counts[k] = 1;
+        visits.half[k][0] = 100.0f;
+        visits.half[k][1] = 80.0f;
+    }
+    for (size_t i = 0; i < model->count; i++)
+        for (int k = 0; k < 2; k++) {
+            model->seen[k][i] = (i + (size_t)k) % 3 == 0;
+            model->screen[k][2 * i] = i % 50 == 0 ? NAN : (float)(1e-4 * gsf_draw_uniform(1, (uint64_t)k, i));
+        }
+    const size_t found = gsf__visit_candidates(&visits, rule.grad);
+    size_t clones, splits;
+    for (size_t c = 0; c < gsf__model_chunks(model->count); c++) gsf__visit_chunk(&visits, c, 0);
+    gsf__densify_select(model, &rule, &clones, &splits);
+    CHECK(found == clones + splits && found > 0 && found < model->count);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
 // Each photo is used once per permutation; each render counts as one visit.
 static void test_order_and_visits(gsf_context* ctx, const scene* s) {
     gsf_train_desc desc = busy_desc();
@@ -1832,6 +1863,7 @@ int main(void) {
     test_learns(&ctx, &s);
     test_mcmc_learns(&ctx, &s);
     test_masked_training(&ctx, &s);
+    test_candidates(&ctx, &s);
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);

@@ -348,8 +348,11 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
             double cover[3] = {0.0, 0.0, 0.0}; // outer two: with zero tolerance, rounding decides about discs in the plane
             for (int k = tolerance > 0.0f; k < 3 - (tolerance > 0.0f); k++) {
                 desc.tolerance = tolerance + close * (float)(k - 1);
-                for (size_t j = 0; j < job.discs.count; j++)
-                    if (j != i) cover[k] += gsf__vis_cover(&job, job.eye, &sight, i, j);
+                for (size_t j = 0; j < job.discs.count; j++) {
+                    const gsf__vis_disc disc = gsf__vis_disc_of(&job, job.eye, j);
+                    const double own = (double)job.discs.spheres[4 * i + 3];
+                    if (j != i) cover[k] += gsf__vis_cover(&disc, &sight, own, (double)desc.tolerance);
+                }
             }
             keep[row] |= cover[1] < limit;
             near[row] |= cover[1] > 0.0 && fabs(cover[1] - limit) < (double)close;
