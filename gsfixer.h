@@ -1250,7 +1250,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define GSF__LANES_scalar 1
 #define GSF__HALVES_scalar 1
 #define GSF__V_KERNEL_scalar
-#define GSF__V_INLINE_scalar GSF__SHARED inline
+#define GSF__V_INLINE_scalar GSF__ALWAYS_INLINE GSF__SHARED inline
 
 typedef float gsf__vf_scalar;
 typedef int32_t gsf__vi_scalar;
@@ -1286,7 +1286,12 @@ GSF__SHARED inline float gsf__v_sum_scalar(float x) { return x; }
 GSF__SHARED inline float gsf__v_largest_scalar(float x) { return x; }
 GSF__SHARED inline void gsf__v_transpose_scalar(float* m) { (void)m; }
 GSF__SHARED inline void gsf__v_pin_scalar(float* v) { (void)v; }
-GSF__SHARED inline void gsf__v_fetch_scalar(const float* p) { (void)p; }
+GSF__V_INLINE_scalar void gsf__v_fetch_scalar(const float* p) {
+#if defined(__GNUC__) || defined(__clang__)
+    __builtin_prefetch(p);
+#endif
+    (void)p;
+}
 GSF__SHARED inline int32_t gsf__v_bits_scalar(float x) {
     int32_t bits;
     memcpy(&bits, &x, sizeof bits);

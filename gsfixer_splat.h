@@ -8345,7 +8345,7 @@ GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf_
 GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                        const gsf_splat_grads* grads, size_t i, size_t left) {
     const size_t count = left < GSF__LANES ? left : GSF__LANES;
-    if (GSF__LANES > 1 && left >= 2 * GSF__LANES) GSF__V(gsf__gather_ahead)(r, splats, grads, i + GSF__LANES);
+    if (left >= 2 * GSF__LANES) GSF__V(gsf__gather_ahead)(r, splats, grads, i + GSF__LANES);
     gsf__vf sums[16];
     const uint32_t touched = GSF__V(gsf__sum_slots)(r, i, count, sums);
     if (!touched) return;
