@@ -7,7 +7,8 @@
 
    WHAT IT DOES NOT DO
        It allocates no memory and reads no files. It does not avoid obstacles: a path may pass through walls (only the
-       path `spread` keeps its distance from the points). It has no smoothing splines (FITPACK's s > 0): its splines interpolate their poses.
+       path `spread` keeps its distance from the points). It has no smoothing splines (FITPACK's s > 0): its splines
+       interpolate their poses.
 
    CONVENTIONS (in addition to those of gsfixer.h)
        pose            camera to world, double[16], column-major, OpenCV axes: column 0 right, 1 down, 2 forward,

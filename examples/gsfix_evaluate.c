@@ -855,7 +855,8 @@ static int eval_check(gsfix_app* app, const eval_plan* plan) {
         code = eval_begin(app, plan, i, &job);
         eval_end(&job);
     }
-    if (!code && !app->o.list_tasks && gsfix_make_meter(app, plan->which, plan->given.caption, 3, &meter) != GSF_OK) code = gsfix_failed(app);
+    if (!code && !app->o.list_tasks && gsfix_make_meter(app, plan->which, plan->given.caption, 3, &meter) != GSF_OK)
+        code = gsfix_failed(app);
     gsfix_destroy_meter(app, meter);
     return code;
 }
