@@ -521,6 +521,10 @@ typedef struct gsf_train_desc {
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent; with mcmc zero = 0.01, negative = off
     float opacity_penalty;         // weight of mean(opacity); with mcmc zero = 0.01, negative = off
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
+    float sharpness;               // 0; above: steps are sharpness-aware, with means moved by this many pixels of the photo
+                                   // against the loss (Foret et al. 2021; for splats FASR, arXiv 2511.17918): the gradient
+                                   // is the mean of those before and after the move. Such a step takes twice the time
+    int32_t sharpness_from;        // iteration after which they are; 0 = 3/4 of the iterations, negative = 0
     int32_t lazy_adam;             // 0; 1: the SH of splats that are not drawn are updated when they are drawn again, to
                                    // the same values up to rounding (5e-7 after 1000 steps); pays off if views see
                                    // little of the scene
@@ -10213,7 +10217,8 @@ struct gsf_trainer {
     gsf__loss_scratch loss;
     gsf_rasterizer* rasterizer;
     float *color, *d_color, *depth, *d_depth; // packed images of the current render
-    size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity;
+    float* means;            // those that a sharpness-aware step has moved, as they were
+    size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity, means_capacity;
     gsf_splats view;         // the model's arrays as splats; with lazy_adam, some SH are out of date
     gsf__lazy lazy;          // model.lazy points here if desc.lazy_adam is set
     gsf_splats shown;        // `view` with all SH up to date
@@ -10430,6 +10435,8 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     d.densify_scale = gsf__or_zero(d.densify_scale, 0.01f);
     d.prune_opacity = gsf__or_zero(d.prune_opacity, 0.005f);
     if (d.prune_scale == 0.0f) d.prune_scale = 0.1f;
+    if (d.sharpness_from == 0) d.sharpness_from = (int32_t)((int64_t)d.iterations * 3 / 4);
+    if (d.sharpness_from < 0) d.sharpness_from = 0;
     if (d.max_splats == 0) d.max_splats = d.mcmc ? 1000000 : 2000000;
     if (d.mcmc) { // defaults of the MCMC authors' code (3dgs-mcmc)
         d.opacity_reset_interval = -1;
@@ -10441,7 +10448,7 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     return d;
 }
 
-enum { GSF__TRAIN_FIELDS = 43 };
+enum { GSF__TRAIN_FIELDS = 45 };
 
 // Every field that a run depends on, with its legal range. `d` has its defaults filled in, except perhaps for the extent.
 static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN_FIELDS]) {
@@ -10488,6 +10495,8 @@ static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN
         {"scale_penalty", (double)d->scale_penalty, 0, 1e6},
         {"opacity_penalty", (double)d->opacity_penalty, 0, 1e6},
         {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
+        {"sharpness", (double)d->sharpness, 0, 1e3},
+        {"sharpness_from", (double)d->sharpness_from, 0, 1e9},
         {"lazy_adam", (double)d->lazy_adam, 0, 1},
     };
     memcpy(out, fields, sizeof fields);
@@ -10926,9 +10935,9 @@ static gsf__densify_rule gsf__trainer_rule(const gsf_trainer* trainer, int32_t i
     return rule;
 }
 
-// The part of a step that can fail: accumulates the gradients in the model. On failure, nothing else has changed.
-static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration,
-                                         gsf__visit_job* visits, gsf_train_stats* stats) {
+// Adds the gradients of this step's photo and restored view, times `share`.
+static gsf_result gsf__trainer_accumulate(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration, float share,
+                                          gsf__visit_job* visits, gsf_train_stats* stats) {
     const gsf_train_desc* d = &trainer->desc;
     gsf__photo* photos[2] = {NULL, NULL};
     photos[0] = gsf__photo_at(&trainer->photos, d->seed, GSF__STREAM_PHOTOS, (uint64_t)iteration - 1);
@@ -10939,7 +10948,7 @@ static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer,
     for (int k = 0; k < 2; k++) {
         if (!photos[k]) continue;
         gsf__loss_value value;
-        GSF__TRY(gsf__trainer_pass(ctx, trainer, photos[k], k, iteration, k ? trainer->restored_weight : 1.0f, &value));
+        GSF__TRY(gsf__trainer_pass(ctx, trainer, photos[k], k, iteration, share * (k ? trainer->restored_weight : 1.0f), &value));
         if (k == 0) {
             stats->loss = value.total;
             stats->l1 = value.l1;
@@ -10952,6 +10961,55 @@ static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer,
         visits->half[k][1] = 0.5f * (float)photos[k]->camera.height;
     }
     return GSF_OK;
+}
+
+// Moves the means up the loss, as far as `radius` pixels at their depth. What is behind the camera stays.
+typedef struct gsf__sharp_job {
+    gsf__model* model;
+    const gsf_camera* camera;
+    const double* origin;
+    double radius;
+} gsf__sharp_job;
+
+static void gsf__sharp_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__sharp_job* job = (const gsf__sharp_job*)arg;
+    const gsf__group* means = &job->model->groups[GSF__MEANS];
+    (void)worker;
+    const size_t end = gsf__model_chunk_end(job->model->count, chunk);
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
+        const float* slope = means->grad + 3 * i;
+        double world[3], p[3], square = 0.0;
+        for (int a = 0; a < 3; a++) {
+            world[a] = job->origin[a] + (double)means->value[3 * i + (size_t)a];
+            square += (double)slope[a] * (double)slope[a];
+        }
+        gsf__camera_transform(job->camera, world, p);
+        if (!(square > 0.0 && square < (double)INFINITY && p[2] > 0.0)) continue;
+        const double step = job->radius * p[2] / (job->camera->fx * sqrt(square));
+        for (int a = 0; a < 3; a++) {
+            const double moved = (double)means->value[3 * i + (size_t)a] + step * (double)slope[a];
+            if (fabs(moved) <= (double)FLT_MAX) means->value[3 * i + (size_t)a] = (float)moved;
+        }
+    }
+}
+
+// The part of a step that can fail: accumulates the gradients in the model. On failure, nothing else has changed.
+static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration,
+                                         gsf__visit_job* visits, gsf_train_stats* stats) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__model* model = &trainer->model;
+    const int sharp = d->sharpness > 0.0f && iteration > d->sharpness_from;
+    if (sharp) GSF__TRY(gsf__reserve(ctx, (void**)&trainer->means, &trainer->means_capacity, 0, 3 * model->count, sizeof(float)));
+    GSF__TRY(gsf__trainer_accumulate(ctx, trainer, iteration, sharp ? 0.5f : 1.0f, visits, stats));
+    if (!sharp) return GSF_OK;
+    const gsf__photo* photo = gsf__photo_at(&trainer->photos, d->seed, GSF__STREAM_PHOTOS, (uint64_t)iteration - 1);
+    gsf__sharp_job job = {model, &photo->camera, trainer->view.origin, (double)d->sharpness};
+    gsf_train_stats ignored;
+    memcpy(trainer->means, model->groups[GSF__MEANS].value, 3 * model->count * sizeof(float));
+    gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__sharp_chunk, &job);
+    const gsf_result result = gsf__trainer_accumulate(ctx, trainer, iteration, 0.5f, visits, &ignored);
+    memcpy(model->groups[GSF__MEANS].value, trainer->means, 3 * model->count * sizeof(float));
+    return result;
 }
 
 static void gsf__trainer_clear_gradients(gsf_trainer* trainer) {
@@ -11218,6 +11276,7 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
     gsf_free(ctx, trainer->d_color);
     gsf_free(ctx, trainer->depth);
     gsf_free(ctx, trainer->d_depth);
+    gsf_free(ctx, trainer->means);
     gsf_free(ctx, trainer);
 }
 

@@ -68,6 +68,8 @@ static const setting settings[] = {
     {"max_splats", SET_COUNT, TRAIN_AT(max_splats), 0, 1e9},
     {"mcmc", SET_SWITCH, TRAIN_AT(mcmc), 0, 1},
     {"mcmc_noise", SET_REAL, TRAIN_AT(mcmc_noise), -1, 1e9},
+    {"sharpness", SET_REAL, TRAIN_AT(sharpness), 0, 1000},
+    {"sharpness_from", SET_WHOLE, TRAIN_AT(sharpness_from), -1, 1e9},
     {"lazy_adam", SET_SWITCH, TRAIN_AT(lazy_adam), 0, 1},
     {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased), 0, 1},
     {"rounds", SET_WHOLE, FIX_AT(rounds), -1, 1000},

@@ -865,6 +865,8 @@ static gsf_train_desc busy_desc(void) {
     desc.depth_smoothness = 0.01f;
     desc.background[1] = 0.2f;
     desc.coarse_until = 12;
+    desc.sharpness = 0.5f;
+    desc.sharpness_from = 40;
     return desc;
 }
 
@@ -1168,6 +1170,49 @@ static void test_coarse(gsf_context* ctx, const scene* s) {
     gsf_destroy_buffer(ctx, &state);
     gsf_splat_destroy_trainer(ctx, coarse);
     gsf_splat_destroy_trainer(ctx, full);
+}
+
+// The gradient of a sharpness-aware step is the mean of those before and after means are moved by so many pixels up the loss.
+static void test_sharpness(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 100;
+    desc.seed = 3;
+    gsf_trainer *plain, *sharp;
+    gsf__visit_job visits;
+    gsf_train_stats a, b;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &plain));
+    desc.sharpness = 2.0f;
+    desc.sharpness_from = -1;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &sharp));
+    CHECK(plain->desc.sharpness_from == 75 && sharp->desc.sharpness_from == 0);
+    memset(&visits, 0, sizeof visits);
+    CHECK_OK(ctx, gsf__trainer_gradients(ctx, sharp, 1, &visits, &a));
+    CHECK(memcmp(sharp->model.groups[GSF__MEANS].value, plain->model.groups[GSF__MEANS].value, 12 * SPLATS) == 0);
+    CHECK_OK(ctx, gsf__trainer_gradients(ctx, plain, 1, &visits, &b));
+    CHECK(a.loss == b.loss);
+    float before[3 * SPLATS], *means = plain->model.groups[GSF__MEANS].value, *slopes = plain->model.groups[GSF__MEANS].grad;
+    double largest = 0.0, worst = 0.0;
+    memcpy(before, slopes, sizeof before);
+    for (size_t i = 0; i < SPLATS; i++) {
+        const float* g = slopes + 3 * i;
+        const double norm = sqrt((double)g[0] * g[0] + (double)g[1] * g[1] + (double)g[2] * g[2]);
+        double point[3], x, y, depth;
+        for (size_t k = 0; k < 3; k++) point[k] = plain->view.origin[k] + (double)means[3 * i + k];
+        if (!(norm > 0.0) || !gsf_project_point(&s->views[0].camera, point, &x, &y, &depth)) continue;
+        const double step = 2.0 * depth / s->views[0].camera.fx / norm;
+        for (size_t k = 0; k < 3; k++) means[3 * i + k] += (float)(step * (double)g[k]);
+    }
+    gsf__trainer_clear_gradients(plain);
+    CHECK_OK(ctx, gsf__trainer_gradients(ctx, plain, 1, &visits, &b));
+    for (size_t i = 0; i < 3 * SPLATS; i++) {
+        const double mean = 0.5 * ((double)before[i] + (double)slopes[i]);
+        largest = fmax(largest, fabs(mean));
+        worst = fmax(worst, fabs((double)sharp->model.groups[GSF__MEANS].grad[i] - mean));
+    }
+    CHECK(b.loss > a.loss && largest > 0.0 && worst < 1e-4 * largest);
+    gsf_splat_destroy_trainer(ctx, plain);
+    gsf_splat_destroy_trainer(ctx, sharp);
 }
 
 // A negative learning rate means 0: that parameter keeps its values, all others learn. lazy: the SH catch up with rates
@@ -1597,7 +1642,7 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     float* floats[] = {&desc.lr_means, &desc.lr_opacity, &desc.extent, &desc.background[2], &desc.densify_grad,
                        &desc.prune_opacity, &desc.dropout, &desc.opacity_decay, &desc.scale_penalty,
                        &desc.depth_smoothness, &desc.render.near_plane, &desc.lambda_ssim, &desc.opacity_penalty,
-                       &desc.mcmc_noise};
+                       &desc.mcmc_noise, &desc.sharpness};
     for (size_t i = 0; i < sizeof floats / sizeof *floats; i++) {
         *floats[i] = NAN;
         CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer),
@@ -1868,6 +1913,7 @@ int main(void) {
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
     test_coarse(&ctx, &s);
+    test_sharpness(&ctx, &s);
     test_settings(&ctx, &s);
     test_linear_photos(&ctx, &s);
     for (int lazy = 0; lazy < 2; lazy++) test_zero_rates(&ctx, &s, lazy);
