@@ -4490,7 +4490,8 @@ static gsf_result gsf__clip_carry(void* user, gsf_context* ctx, int32_t frame, i
     int32_t channels[GSF__CARRIED_IMAGES];
     if (frame < 0 || frame >= c->shown)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "clip: frame %d of %d is to be carried", (int)frame, (int)c->shown);
-    GSF__TRY(c->window->carry_fn(c->window->carry_user, ctx, c->begin + gsf__clip_spread(frame, c->shown, c->taken), slot, out));
+    const int32_t at = c->begin + gsf__clip_spread(frame, c->shown, c->taken);
+    GSF__TRY(c->window->carry_fn(c->window->carry_user, ctx, at, slot, out));
     gsf__list_carried(out, images, channels);
     for (int k = 0; k < GSF__CARRIED_IMAGES; k++) {
         gsf_image* kept = c->carried + k;

@@ -37,6 +37,7 @@
                                                                    | gsf_splat_render_trainer                      |
                                                                    v                                               |
          gsf_fixer:  path (gsfixer_traj.h) ------> frames of a window: colour, depth, alpha ------> gsf_restorer --'
+                     photos -> stereo, exposure (once) -> scores (every round) -> what they show in a frame -^  (>>carry)
 
    STEP BY STEP
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
@@ -83,6 +84,9 @@
                         help of --restorer, gsfix_check_restorer, gsfix_make_restorer, gsfix_destroy_restorer (`none` is
                         NULL) and, if `gsfix restore` can lack its inputs, a check like check_warp_clip. The list in
                         README.md. Tests: tests/test_fixer.c, tests/test_gsfix.sh
+       what photos show in a frame    a member of gsf_carried (gsfixer.h), its place in gsf__list_carried, and in >>carry
+                        gsf__carry_row, which fills it in. What makes a pixel more or less certain: gsf__carry_score_row.
+                        Tests: tests/test_carry.c
        a start          gsf_initial_kind, in >>few views
 
    ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
@@ -91,8 +95,12 @@
    MEMORY      Everything comes from the context's allocator, except scratch memory of Embree and stb. A trainer takes about
                1 kB per splat of SH degree 3 and, per pixel of a photo, 3 bytes (u8) or 12 (f32), and 4 more with a weight.
                The repair loop holds no other copy: while a round begins the restorer is shown photos as floats (with the
-               splats' render and depth 28 bytes per pixel); `warp` keeps 20 bytes per pixel until the round ends (29 of
-               photos that are not 8-bit or have masks). A restored frame takes 7 bytes per pixel while it is trained on.
+               splats' render and depth 28 bytes per pixel). For `warp`, and any restorer that asks for carried photos, it
+               keeps 20 bytes per pixel of the photos until the round ends (29 if they are not 8-bit or have masks; as much
+               again for `warp` until its first window), and until the run ends 4 bytes per pixel of their depth maps, at
+               most 320 pixels long; a frame takes 4 bytes per pixel and reference, 52 more if it is handed out. Stereo, once
+               per run, takes 80 bytes per pixel of its working size while it runs.
+               A restored frame takes 7 bytes per pixel while it is trained on.
                Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
@@ -102,7 +110,7 @@
                convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
-               >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer >>few views
+               >>render >>loss >>adam >>densify >>trainer >>carry >>warp >>seen mask >>fixer >>few views
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -567,10 +575,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 
 // ---- restorers -----------------------------------------------------------------
 
-// Training-free restorer: reprojects the residual of the reference photos (photo - render) through the splats' depth
-// with occlusion tests, blends by confidence, and adds it to the frame; where no reference sees a pixel, the render is
-// kept. Floaters, identified by two references that see through them, are replaced by the photos behind them. For
-// references without a render, the photos themselves are reprojected. Fills *out; out->user is freed by
+// Training-free restorer: shows in a frame what the reference photos show of it. Where other photos confirm depth and
+// colour, the photos' colours replace the render, at the mean exposure of all photos; where only the splats vouch for the
+// depth, the residual (photo - render at the photo's camera) is added to it, with less confidence; where no reference sees
+// a pixel, the render is kept with confidence 0. Floaters, identified by two references that see through them, are
+// replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
+// splats. Without renders of the references, colours are taken everywhere. Fills *out; out->user is freed by
 // gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
@@ -10938,11 +10948,13 @@ typedef struct gsf__carrier {
 #define GSF__CARRY_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
 enum {
     GSF__CARRY_VERIFIED = 50,  // score from which depth and colour are confirmed by another photo
+    GSF__CARRY_ALIKE = 50,     // percent: likeness from which windows of two photos show the same
     GSF__CARRY_WINDOW = 3,     // radius of the windows that are compared between photos
     GSF__CARRY_BAND = 16,      // rows of a frame that are drawn together
     GSF__CARRY_OTHERS = 8,     // most references that judge another one
+    GSF__CARRY_LEVELS = 6,     // of the pyramid that corrects the splats' depth
     GSF__CARRY_SLOTS = 9,      // most references that are ranked
-    GSF__CARRY_STEREO_SIZE = 480, // most pixels along a side that stereo works with
+    GSF__CARRY_STEREO_SIZE = 320, // most pixels along a side that stereo works with
 };
 
 static void gsf__carrier_close(gsf_context* ctx, gsf__carrier* carrier) {
@@ -11252,9 +11264,12 @@ static gsf_result gsf__carrier_study(gsf_context* ctx, gsf__carrier* carrier, gs
     desc.want_maps = 1;
     desc.spacing = 1024; // the points are not needed
     desc.max_size = GSF__CARRY_STEREO_SIZE;
-    desc.max_cost = 0.35f; desc.max_cost_many = 0.5f;
-    desc.iterations = 2; desc.radius = 5;
-    if (result == GSF_OK && count > 1)
+    desc.max_cost = 0.5f;      // more than for points that splats are made of: the score also compares the photos
+    desc.max_cost_many = 0.6f;
+    int large = count > 1;
+    for (int32_t i = 0; i < count; i++)
+        large &= views[i].camera.width >= GSF__DENSE_MIN_SIDE && views[i].camera.height >= GSF__DENSE_MIN_SIDE;
+    if (result == GSF_OK && large) // its windows would fill a smaller photo
         result = gsf_splat_make_dense(ctx, &scene, order, (size_t)count, NULL, &desc, &dense, NULL);
     if (result == GSF_OK) result = gsf__carry_keep_maps(ctx, carrier, &dense);
     if (result == GSF_OK) result = gsf__carry_expose(ctx, carrier, views);
@@ -11397,7 +11412,7 @@ static int gsf__carry_likeness(const gsf__carry_score_job* job, int32_t x, int32
             bb += q * q;
             ab += p * q;
         }
-    if (n < 12.0f) return 0;
+    if (n < 24.0f) return 0;
     const float mean_a = a / n, mean_b = b / n, var_a = aa / n - mean_a * mean_a, var_b = bb / n - mean_b * mean_b;
     const float noise = 0.012f * 0.012f;
     if (var_a < noise && var_b < noise) return fabsf(mean_a - mean_b) < 0.04f ? 60 : 0;
@@ -11430,10 +11445,64 @@ static void gsf__carry_score_row(void* arg, size_t row, int32_t worker) {
         if (!(ref->depth[at] > 0.0f)) score = 0;
         else if (job->stereo[at]) score = refuted > support ? 40 : 100;
         else if (refuted > support) score = 5;
-        else if (support == 0) score = 30;
-        else score = alike >= 60 ? 70 : 40;
+        else if (support == 0) score = 30; // no other reference shows the place
+        else score = alike >= GSF__CARRY_ALIKE ? 70 : 40;
         ref->score[at] = (uint8_t)score;
     }
+}
+
+// Corrects the splats' depth where stereo is silent by the ratio of both around it: the log of the ratio is averaged in a
+// pyramid of sums, and every pixel takes it from the finest level that has evidence.
+static gsf_result gsf__carry_correct(gsf_context* ctx, gsf__carry_reference* ref, const float* confirmed) {
+    gsf__arena arena = {ctx, NULL, 0};
+    float *sum[GSF__CARRY_LEVELS], *weight[GSF__CARRY_LEVELS];
+    int32_t width[GSF__CARRY_LEVELS], height[GSF__CARRY_LEVELS];
+    const float prior = 0.05f; // pixels' worth of evidence that the next coarser level counts for
+    for (int l = 0; l < GSF__CARRY_LEVELS; l++) {
+        width[l] = l ? (width[l - 1] + 1) / 2 : ref->camera.width;
+        height[l] = l ? (height[l - 1] + 1) / 2 : ref->camera.height;
+        sum[l] = (float*)gsf__arena_alloc_zeroed(&arena, (size_t)width[l] * (size_t)height[l], sizeof(float));
+        weight[l] = (float*)gsf__arena_alloc_zeroed(&arena, (size_t)width[l] * (size_t)height[l], sizeof(float));
+    }
+    if (arena.failed) {
+        gsf__arena_free(&arena);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    const size_t pixels = (size_t)width[0] * (size_t)height[0];
+    for (size_t at = 0; at < pixels; at++) {
+        if (!(confirmed[at] > 0.0f && ref->depth[at] > 0.0f)) continue;
+        const float off = confirmed[at] / ref->depth[at] - 1.0f;
+        if (!(fabsf(off) < 0.2f)) continue; // a floater, or the background through a hole
+        sum[0][at] = off;
+        weight[0][at] = 1.0f;
+    }
+    for (int l = 1; l < GSF__CARRY_LEVELS; l++)
+        for (int32_t y = 0; y < height[l - 1]; y++)
+            for (int32_t x = 0; x < width[l - 1]; x++) {
+                const size_t from = (size_t)y * (size_t)width[l - 1] + (size_t)x;
+                const size_t to = (size_t)(y / 2) * (size_t)width[l] + (size_t)(x / 2);
+                sum[l][to] += sum[l - 1][from];
+                weight[l][to] += weight[l - 1][from];
+            }
+    for (int l = GSF__CARRY_LEVELS - 1; l >= 0; l--) // sum becomes the mean at the level
+        for (int32_t y = 0; y < height[l]; y++)
+            for (int32_t x = 0; x < width[l]; x++) {
+                const size_t at = (size_t)y * (size_t)width[l] + (size_t)x;
+                float coarse = 0.0f;
+                if (l + 1 < GSF__CARRY_LEVELS) {
+                    gsf_camera level;
+                    gsf__taps taps;
+                    memset(&level, 0, sizeof level);
+                    level.width = width[l + 1];
+                    level.height = height[l + 1];
+                    if (gsf__find_taps(&level, 0.5 * (x + 0.5), 0.5 * (y + 0.5), &taps))
+                        coarse = gsf__sample_floats(sum[l + 1], 1, 0, &taps);
+                }
+                sum[l][at] = (sum[l][at] + prior * coarse) / (weight[l][at] + prior);
+            }
+    for (size_t at = 0; at < pixels; at++) ref->depth[at] *= 1.0f + sum[0][at];
+    gsf__arena_free(&arena);
+    return GSF_OK;
 }
 
 // Replaces the depth of every reference by that of stereo where there is one, and scores all pixels.
@@ -11462,24 +11531,30 @@ static gsf_result gsf__carrier_score(gsf_context* ctx, gsf__carrier* carrier) {
         gsf__arena_free(&arena);
         return GSF_ERROR_OUT_OF_MEMORY;
     }
+    gsf_result result = GSF_OK;
+    float* confirmed = job.seen;
     job.refuted = job.support + most;
     job.alike = job.refuted + most;
-    for (int32_t i = 0; i < carrier->count; i++) {
+    for (int32_t i = 0; i < carrier->count && result == GSF_OK; i++) {
         gsf__carry_reference* ref = carrier->references + i;
         const int32_t width = ref->camera.width, height = ref->camera.height;
         const gsf__carry_study* study = i < carrier->study_count ? carrier->studies + i : NULL;
         for (int32_t y = 0; y < height; y++)
+            for (int32_t x = 0; x < width; x++)
+                confirmed[(size_t)y * (size_t)width + (size_t)x] =
+                    study ? gsf__carry_stereo_depth(study, &ref->camera, x, y) : 0.0f;
+        if (study && study->depth) result = gsf__carry_correct(ctx, ref, confirmed);
+        for (int32_t y = 0; y < height; y++)
             for (int32_t x = 0; x < width; x++) {
                 const size_t at = (size_t)y * (size_t)width + (size_t)x;
-                const float confirmed = study ? gsf__carry_stereo_depth(study, &ref->camera, x, y) : 0.0f;
                 float rgb[3];
                 gsf__carry_pixel(carrier, i, at, rgb);
                 grey[i][at] = 0.299f * rgb[0] + 0.587f * rgb[1] + 0.114f * rgb[2];
-                stereo[i][at] = confirmed > 0.0f;
-                if (confirmed > 0.0f) ref->depth[at] = confirmed;
+                stereo[i][at] = confirmed[at] > 0.0f;
+                if (stereo[i][at]) ref->depth[at] = confirmed[at];
             }
     }
-    for (int32_t i = 0; i < carrier->count; i++) {
+    for (int32_t i = 0; i < carrier->count && result == GSF_OK; i++) {
         const gsf__carry_reference* ref = carrier->references + i;
         const size_t rows = (size_t)ref->camera.height;
         int32_t others[GSF__CARRY_OTHERS + 1];
@@ -11496,7 +11571,7 @@ static gsf_result gsf__carrier_score(gsf_context* ctx, gsf__carrier* carrier) {
         gsf__parallel_for(ctx, rows, gsf__carry_score_row, &job);
     }
     gsf__arena_free(&arena);
-    return GSF_OK;
+    return result;
 }
 
 // Copies the references. After an error the carrier is closed.
@@ -11529,8 +11604,9 @@ static void gsf__carry_triangle(const gsf__carry_vertex* a, const gsf__carry_ver
     const float lo_v = fminf(a->v, fminf(b->v, c->v)), hi_v = fmaxf(a->v, fmaxf(b->v, c->v));
     if (!(hi_u > 0.0f && hi_v > (float)begin && lo_u < (float)width && lo_v < (float)end)) return;
     if (hi_u - lo_u > 32.0f || hi_v - lo_v > 32.0f) return;
-    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), y0 = lo_v < (float)begin + 0.5f ? begin : (int32_t)(lo_v - 0.5f);
-    const int32_t x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1, y1 = hi_v < (float)end ? (int32_t)hi_v : end - 1;
+    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1;
+    const int32_t y0 = lo_v < (float)begin + 0.5f ? begin : (int32_t)(lo_v - 0.5f);
+    const int32_t y1 = hi_v < (float)end ? (int32_t)hi_v : end - 1;
     const float scale = 1.0f / area;
     for (int32_t y = y0; y <= y1; y++)
         for (int32_t x = x0; x <= x1; x++) {
@@ -11803,7 +11879,8 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     out->needs_depth = 1;
     out->explains = 1;
     if (out->struct_size >= sizeof *out) out->needs_carried = GSF__WARP_NEAREST;
-    const int32_t count = warp->own.count > 0 ? warp->own.count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
+    const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
+    const int32_t drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
     out->bytes = (double)width * height * (20.0 * count + 4.0 * drawn + 12.0);
     out->flops = (double)width * height * frame_count * 200.0 * drawn;
     return GSF_OK;
@@ -11882,7 +11959,7 @@ typedef struct gsf__warp_job {
 
 // Returns 1 if the surface that the frame shows at camera depth `z` is a floater: at least two references look through
 // it, and none shows a surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges).
-static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z, int least) {
+static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z) {
     int through = 0;
     double point[3], u, v, depth;
     gsf__unproject(camera, x + 0.5, y + 0.5, z, point);
@@ -11900,7 +11977,7 @@ static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera,
         }
         through += behind == 9;
     }
-    return through >= least;
+    return through >= 2;
 }
 
 typedef struct gsf__warp_candidate {
@@ -11947,11 +12024,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
         verified |= fabsf(candidates[i].sample.depth - front) <= GSF__CARRY_DEPTH_TOLERANCE * front &&
                     candidates[i].sample.score >= 0.01f * (float)GSF__CARRY_VERIFIED;
     const int behind = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
-    const int refuted = behind && gsf__warp_refutes(job, camera, x, y, (double)shown, verified ? 1 : 2);
-    if (0 && verified && front > shown * (1.0f + GSF__CARRY_DEPTH_TOLERANCE) && shown > 0.0f && !refuted) {
-        if (0 == 2) return 0.0f;
-        verified = 0;
-    }
+    const int refuted = !verified && behind && gsf__warp_refutes(job, camera, x, y, (double)shown);
     const int colors = refuted || verified || !job->carrier->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
@@ -11972,9 +12045,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
         rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
-    if (verified) return 1.0f * agreement;
-    if (refuted) return agreement;
-    return 1.0f * (total > 1.0f ? 1.0f : total) * agreement;
+    return (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
 static void gsf__warp_row(void* arg, size_t row, int32_t worker) {
