@@ -453,7 +453,7 @@ typedef struct gsf_reference { // a photo the scene was trained on
 // how well it is verified: 1 = the photos agree on it, from 0.5 on at least one other photo confirms depth and colour,
 // below that nothing but the splats vouches for the depth; 0 = the reference shows nothing here (the other images are then
 // 0, too). Where surfaces of the reference cover each other the nearest one counts, but one that only another reference
-// shows covers nothing: compare the depths. Colours are of the mean exposure of all photos. The last two images do not
+// shows covers nothing: compare the depths. Colours are of one exposure per frame, like the photos around it. The last two images do not
 // depend on the reference's depth being right: they look up the photo where the frame's own depth puts the pixel.
 typedef struct gsf_carried {
     int32_t reference;    // index into the references; -1, with images that are 0, if there are fewer

@@ -576,8 +576,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 // ---- restorers -----------------------------------------------------------------
 
 // Training-free restorer: shows in a frame what the reference photos show of it. Where other photos confirm depth and
-// colour, the photos' colours replace the render, at the mean exposure of all photos; where only the splats vouch for the
-// depth, the residual (photo - render at the photo's camera) is added to it, with less confidence; where no reference sees
+// colour, the photos' colours replace the render, at the exposure of the photos around; where only the splats vouch for
+// the depth, the residual (photo - render at the photo's camera) is added to it, with less confidence; where no reference sees
 // a pixel, the render is kept with confidence 0. Floaters, identified by two references that see through them, are
 // replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
 // splats. Without renders of the references, colours are taken everywhere. Fills *out; out->user is freed by
@@ -10912,8 +10912,9 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
                  that depth, do their photos look alike around it, does one look through it (free-space violation)?
        draw      per frame and reference: the depth map, cut at depth edges, is rasterized as a triangle mesh into a z-buffer
                  of the frame. A pixel's depth there gives its position in the reference, and so all else.
-   A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to the
-   mean exposure. Residuals (photo - render) are not: the splats follow each photo's own exposure. */
+   A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to one
+   exposure per frame: that of the photos around it, since exposure and shading change gradually along a capture, and since
+   the frame would otherwise contradict the photos near it. Residuals (photo - render) are not: the splats follow each photo's own exposure. */
 
 typedef struct gsf__carry_reference {
     gsf_camera camera;
@@ -10939,6 +10940,7 @@ typedef struct gsf__carrier {
     int32_t count;
     gsf__carry_reference* references; // of the round; NULL unless open
     int has_residuals;
+    float gain[3], offset[3];         // what brings the exposure of the frame that was drawn last to the mean
     float* inv_z;                     // scratch for one frame: z-buffers, one per slot
     void* vertices;                   // of one reference, and for each of its rows the range of their positions
     size_t inv_z_capacity, vertex_capacity;
@@ -11043,10 +11045,11 @@ static float gsf__photo_color(const gsf__carry_reference* ref, size_t channel, c
 static float gsf__carry_expose_value(const gsf__carrier* carrier, int32_t reference, size_t channel, float value) {
     if (reference >= carrier->study_count) return value;
     value = carrier->studies[reference].gain[channel] * value + carrier->studies[reference].offset[channel];
+    value = (value - carrier->offset[channel]) / carrier->gain[channel];
     return value > 1.0f ? 1.0f : value > 0.0f ? value : 0.0f;
 }
 
-// A channel of the photo at the mean exposure.
+// A channel of the photo at the exposure of the frame.
 static float gsf__carry_color(const gsf__carrier* carrier, int32_t reference, size_t channel, const gsf__taps* taps) {
     return gsf__carry_expose_value(carrier, reference, channel,
                                    gsf__photo_color(carrier->references + reference, channel, taps));
@@ -11078,6 +11081,28 @@ static int gsf__carry_nearest(const gsf__carrier* carrier, const double center[3
         }
     }
     return count;
+}
+
+// Sets the exposure of a frame at `center` (NULL: the mean): that of the references, weighted by the inverse of the squared
+// angle between their viewing directions and the frame's.
+static void gsf__carry_set_exposure(gsf__carrier* carrier, const double* center) {
+    double gain[3] = {0.0, 0.0, 0.0}, offset[3] = {0.0, 0.0, 0.0}, total = 0.0;
+    int32_t nearest[GSF__CARRY_SLOTS];
+    const int count = center && carrier->study_count ? gsf__carry_nearest(carrier, center, nearest, GSF__CARRY_SLOTS) : 0;
+    for (int k = 0; k < count; k++) {
+        const gsf__carry_reference* ref = carrier->references + nearest[k];
+        const gsf__carry_study* study = carrier->studies + nearest[k];
+        const double weight = 1.0 / (fmax(0.0, 1.0 - gsf__ray_cosine(ref->focus, center, ref->center)) + 1e-4);
+        total += weight;
+        for (int c = 0; c < 3; c++) {
+            gain[c] += weight * (double)study->gain[c];
+            offset[c] += weight * (double)study->offset[c];
+        }
+    }
+    for (int c = 0; c < 3; c++) {
+        carrier->gain[c] = count ? (float)(gain[c] / total) : 1.0f;
+        carrier->offset[c] = count ? (float)(offset[c] / total) : 0.0f;
+    }
 }
 
 // ---- what depends only on the photos
@@ -11533,6 +11558,7 @@ static gsf_result gsf__carrier_score(gsf_context* ctx, gsf__carrier* carrier) {
     }
     gsf_result result = GSF_OK;
     float* confirmed = job.seen;
+    gsf__carry_set_exposure(carrier, NULL);
     job.refuted = job.support + most;
     job.alike = job.refuted + most;
     for (int32_t i = 0; i < carrier->count && result == GSF_OK; i++) {
@@ -11693,6 +11719,9 @@ static gsf_result gsf__carrier_draw(gsf_context* ctx, gsf__carrier* carrier, con
     GSF__TRY(gsf__reserve(ctx, &carrier->vertices, &carrier->vertex_capacity, 0, room, 1));
     GSF__TRY(gsf__reserve(ctx, (void**)&carrier->inv_z, &carrier->inv_z_capacity, 0, plane * (size_t)count, sizeof(float)));
     memset(carrier->inv_z, 0, plane * (size_t)count * sizeof(float));
+    double center[3];
+    gsf_get_camera_center(camera, center);
+    gsf__carry_set_exposure(carrier, center);
     for (int k = 0; k < count; k++) {
         gsf__carry_draw_job job;
         job.ref = carrier->references + nearest[k];
@@ -11847,7 +11876,7 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
 /* Training-free restorer: shows in a frame what the references (>>carry) explain of it. Per pixel, the candidates of the
    nearest references are grouped by depth, and the nearest group with enough weight wins (occlusion).
        verified    A candidate whose depth and colour another photo confirms is right information, whatever the splats look
-                   like: its colour, the photo's at the mean exposure, replaces the render. Candidates of the same group that
+                   like: its colour, at the exposure of the photos around, replaces the render. Candidates of the same group that
                    are not verified are left out.
        supported   Where only the splats vouch for the depth, a carried photo would displace all detail by the depth error
                    and bring its shading along. The residual, photo - render at the photo's own camera, is what the splats
