@@ -448,13 +448,14 @@ typedef struct gsf_reference { // a photo the scene was trained on
     gsf_camera camera;
 } gsf_reference;
 
-// What one reference shows in a frame: f32 images of the frame's size. The photo is carried there through the reference's
-// own depth, which is that of stereo between the photos or, where stereo is silent, that of the splats. The score says
-// how well it is verified: 1 = the photos agree on it, from 0.5 on at least one other photo confirms depth and colour,
-// below that nothing but the splats vouches for the depth; 0 = the reference shows nothing here (the other images are then
-// 0, too). Where surfaces of the reference cover each other the nearest one counts, but one that only another reference
-// shows covers nothing: compare the depths. Colours are of one exposure per frame, like the photos around it. The last two images do not
-// depend on the reference's depth being right: they look up the photo where the frame's own depth puts the pixel.
+// What one reference shows in a frame: f32 images of the frame's size. The photo is carried there through the
+// reference's own depth, which is that of stereo between the photos or, where stereo is silent, that of the splats. The
+// score says how well it is verified: 1 = the photos agree on it, from 0.5 on at least one other photo confirms depth
+// and colour, below that nothing but the splats vouches for the depth; 0 = the reference shows nothing here (the other
+// images are then 0, too). Where surfaces of the reference cover each other the nearest one counts, but one that only
+// another reference shows covers nothing: compare the depths. Colours are of one exposure per frame, like the photos
+// around it. The last two images do not depend on the reference's depth being right: they look up the photo where the
+// frame's own depth puts the pixel.
 typedef struct gsf_carried {
     int32_t reference;    // index into the references; -1, with images that are 0, if there are fewer
     gsf_image color;      // 3 channels: the photo

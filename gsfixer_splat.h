@@ -576,8 +576,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 // ---- restorers -----------------------------------------------------------------
 
 // Training-free restorer: shows in a frame what the reference photos show of it. Where other photos confirm depth and
-// colour, the photos' colours replace the render, at the exposure of the photos around; where only the splats vouch for
-// the depth, the residual (photo - render at the photo's camera) is added to it, with less confidence; where no reference sees
+// colour, the photos' colours replace a render that shows another depth, and the residual (photo - render at the photo's
+// camera) is added in full to one that agrees; where only the splats vouch for the depth, the residual is added with less
+// weight and less confidence; where no reference sees
 // a pixel, the render is kept with confidence 0. Floaters, identified by two references that see through them, are
 // replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
 // splats. Without renders of the references, colours are taken everywhere. Fills *out; out->user is freed by
@@ -10912,9 +10913,10 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
                  that depth, do their photos look alike around it, does one look through it (free-space violation)?
        draw      per frame and reference: the depth map, cut at depth edges, is rasterized as a triangle mesh into a z-buffer
                  of the frame. A pixel's depth there gives its position in the reference, and so all else.
-   A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to one
-   exposure per frame: that of the photos around it, since exposure and shading change gradually along a capture, and since
-   the frame would otherwise contradict the photos near it. Residuals (photo - render) are not: the splats follow each photo's own exposure. */
+   A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to
+   one exposure per frame: that of the photos around it, since exposure and shading change gradually along a capture,
+   and since the frame would otherwise contradict the photos near it. Residuals (photo - render) are not: the splats
+   follow each photo's own exposure. */
 
 typedef struct gsf__carry_reference {
     gsf_camera camera;
@@ -11875,9 +11877,10 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
 
 /* Training-free restorer: shows in a frame what the references (>>carry) explain of it. Per pixel, the candidates of the
    nearest references are grouped by depth, and the nearest group with enough weight wins (occlusion).
-       verified    A candidate whose depth and colour another photo confirms is right information, whatever the splats look
-                   like: its colour, at the exposure of the photos around, replaces the render. Candidates of the same group that
-                   are not verified are left out.
+       verified    A candidate whose depth and colour another photo confirms is right information. If the frame shows
+                   another depth, its colour, at the exposure of the photos around, replaces the render; if the frame
+                   agrees, its residual is added in full, which keeps the render's shading (with six photos, colours
+                   there cost 0.2 dB). Candidates of the same group that are not verified are left out.
        supported   Where only the splats vouch for the depth, a carried photo would displace all detail by the depth error
                    and bring its shading along. The residual, photo - render at the photo's own camera, is what the splats
                    do not yet explain; it is added to the render.
@@ -12054,7 +12057,8 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
                     candidates[i].sample.score >= 0.01f * (float)GSF__CARRY_VERIFIED;
     const int behind = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
     const int refuted = !verified && behind && gsf__warp_refutes(job, camera, x, y, (double)shown);
-    const int colors = refuted || verified || !job->carrier->has_residuals;
+    const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
+    const int colors = refuted || (verified && !agrees) || !job->carrier->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
         const gsf__warp_candidate* at = candidates + i;
@@ -12073,7 +12077,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     for (int c = 0; c < 3; c++) spread -= sum[c] / total * (sum[c] / total);
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
-        rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
+        rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
     return (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
