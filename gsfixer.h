@@ -80,7 +80,9 @@
        a restorer       gsf_restorer under "restorer interface": struct_size and all four functions. query_fn runs before
                         begin_fn, and for every clip of gsf_restore_clip, so it changes nothing; begin_fn and end_fn run
                         once per round. restore_fn writes every pixel of out_color and out_confidence, which are undefined
-                        before. gsf_splat_make_warp in gsfixer_splat.h is an example
+                        before. If query_fn sets needs_carried, restore_fn may ask window->carry_fn (unless NULL, or
+                        beyond struct_size) for the photos as they appear in a frame. gsf_splat_make_warp in
+                        gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
    SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
@@ -443,6 +445,8 @@ typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
                                     // nothing: the loop compares it with the renders to find windows that need no
                                     // repair, instead of reprojecting the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
+    int32_t needs_carried;          // references per frame that it asks for with carry_fn; 0 = none. A restorer sets it
+                                    // only if struct_size covers it
 } gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on
@@ -451,6 +455,26 @@ typedef struct gsf_reference { // a photo the scene was trained on
     gsf_image depth;  // f32 camera depth rendered from the splats, 0 = none; data NULL unless needs_depth
     gsf_camera camera;
 } gsf_reference;
+
+// What one reference shows in a frame: f32 images of the frame's size. The photo is carried there through the
+// reference's own depth, which is that of stereo between the photos or, where stereo is silent, that of the splats. The
+// score says how well it is verified: 1 = the photos agree on it, from 0.5 on at least one other photo confirms depth
+// and colour, below that nothing but the splats vouches for the depth; 0 = the reference shows nothing here (the other
+// images are then 0, too). Where surfaces of the reference cover each other the nearest one counts, but one that only
+// another reference shows covers nothing: compare the depths. Colours are of one exposure per frame, like the photos
+// around it. The last two images do not depend on the reference's depth being right: they look up the photo where the
+// frame's own depth puts the pixel.
+typedef struct gsf_carried {
+    int32_t reference;    // index into the references; -1, with images that are 0, if there are fewer
+    gsf_image color;      // 3 channels: the photo
+    gsf_image residual;   // 3 channels: photo - render at the photo's camera, in the photo's own exposure
+    gsf_image score;      // 1 channel, [0,1]
+    gsf_image depth;      // 1 channel: camera depth in the frame of what the reference shows
+    gsf_image angle;      // 1 channel: radians, at that point, between the rays to the frame and to the reference
+    gsf_image back_color; // 3 channels: the photo at the point that the frame shows
+    gsf_image back_ratio; // 1 channel: that point's depth in the reference / the reference's own depth there; 0 = outside
+                          // the photo, or no depth there or in the frame. Above 1 = hidden from the reference
+} gsf_carried;
 
 typedef struct gsf_restore_window { // one clip; all pointers are borrowed for the call
     uint32_t struct_size;
@@ -466,7 +490,11 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
     gsf_image* out_confidence;        // f32, 1 channel, [0,1]; weight of each restored pixel in training
     int32_t clip;                     // index of the clip in its run, from 0; continues across the loop's rounds
     int32_t part;                     // index of the part if a clip is restored in several parts, from 0
-} gsf_restore_window;
+    // What the slot-th nearest reference (from 0) shows in a frame of the window; *out is borrowed until the next call. NULL
+    // unless needs_carried, and if the host cannot tell. Frames are carried when they are asked for, so ask once.
+    gsf_result (*carry_fn)(void* carry_user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out);
+    void* carry_user;
+} gsf_restore_window;                 // struct_size may end before carry_fn, which is then not there
 
 // One restorer serves one loop at a time: its state belongs to one run, from begin_fn to end_fn.
 typedef struct gsf_restorer {
@@ -993,6 +1021,25 @@ GSF__SHARED int32_t gsf__legal_count(int32_t wanted, int32_t least, int32_t most
 GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t most) {
     if (multiple < 1) multiple = 1;
     return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
+}
+
+enum { GSF__CARRIED_IMAGES = 7, GSF__WINDOW_BYTES = offsetof(gsf_restore_window, carry_fn) };
+
+// The images of a gsf_carried in their order, and their channels.
+GSF__SHARED void gsf__list_carried(gsf_carried* carried, gsf_image* images[GSF__CARRIED_IMAGES],
+                              int32_t channels[GSF__CARRIED_IMAGES]) {
+    static const int32_t counts[GSF__CARRIED_IMAGES] = {3, 3, 1, 1, 1, 3, 1};
+    gsf_image* const list[GSF__CARRIED_IMAGES] = {&carried->color, &carried->residual, &carried->score, &carried->depth,
+                                                  &carried->angle, &carried->back_color, &carried->back_ratio};
+    memcpy(images, list, sizeof list);
+    memcpy(channels, counts, sizeof counts);
+}
+
+typedef gsf_result (*gsf__carry_fn)(void* carry_user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out);
+
+// The window's carry_fn; NULL also if an older host's window ends before it.
+GSF__SHARED gsf__carry_fn gsf__carry_fn_of(const gsf_restore_window* window) {
+    return window->struct_size >= sizeof *window ? window->carry_fn : NULL;
 }
 
 // Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist either.
@@ -4487,6 +4534,8 @@ typedef struct gsf__clip { // state of gsf_restore_clip
     gsf_camera* cameras;
     int32_t* reference_index;
     float* weight;              // (frame_count) sum of blend weights of each frame so far
+    int32_t begin;              // first frame of the current part
+    gsf_image carried[GSF__CARRIED_IMAGES]; // resized, of the last call of gsf__clip_carry
 } gsf__clip;
 
 // Spreads `from` indices evenly over 0..to-1 and returns where index i goes, rounded.
@@ -4536,11 +4585,12 @@ static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
 // Nearest-neighbour resize, for depths: an interpolated depth at an edge would lie on neither surface.
 static void gsf__clip_pick(const gsf_image* from, const gsf_image* to) {
     for (int64_t y = 0; y < to->height; y++)
-        for (int64_t x = 0; x < to->width; x++) {
-            const char* p = (const char*)from->data + (2 * y + 1) * from->height / (2 * to->height) * from->stride_y +
-                            (2 * x + 1) * from->width / (2 * to->width) * from->stride_x;
-            memcpy((char*)to->data + y * to->stride_y + x * to->stride_x, p, sizeof(float));
-        }
+        for (int64_t x = 0; x < to->width; x++)
+            for (int64_t k = 0; k < to->channels; k++) {
+                const char* p = (const char*)from->data + (2 * y + 1) * from->height / (2 * to->height) * from->stride_y +
+                                (2 * x + 1) * from->width / (2 * to->width) * from->stride_x + k * from->stride_c;
+                memcpy((char*)to->data + y * to->stride_y + x * to->stride_x + k * to->stride_c, p, sizeof(float));
+            }
 }
 
 enum { GSF__CLIP_FLOATS, GSF__CLIP_BYTES, GSF__CLIP_NEAREST }; // how to resize: BYTES in u8, as PIL resizes photos
@@ -4635,10 +4685,36 @@ static gsf_result gsf__clip_give(gsf_context* ctx, gsf__clip* c, int32_t begin) 
     return GSF_OK;
 }
 
+// carry_fn of a part: that of the clip, at the size of the part's frames. Nearest neighbours, since a pixel between two
+// surfaces, or between something and nothing, would show neither.
+static gsf_result gsf__clip_carry(void* user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out) {
+    gsf__clip* c = (gsf__clip*)user;
+    gsf_image* images[GSF__CARRIED_IMAGES];
+    int32_t channels[GSF__CARRIED_IMAGES];
+    if (frame < 0 || frame >= c->shown)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "clip: frame %d of %d is to be carried", (int)frame, (int)c->shown);
+    const int32_t at = c->begin + gsf__clip_spread(frame, c->shown, c->taken);
+    GSF__TRY(c->window->carry_fn(c->window->carry_user, ctx, at, slot, out));
+    gsf__list_carried(out, images, channels);
+    for (int k = 0; k < GSF__CARRIED_IMAGES; k++) {
+        gsf_image* kept = c->carried + k;
+        if (!kept->data) GSF__TRY(gsf_make_image(ctx, GSF_F32, c->width, c->height, channels[k], kept));
+        gsf__clip_pick(images[k], kept);
+        *images[k] = *kept;
+        images[k]->owned = NULL;
+    }
+    return GSF_OK;
+}
+
 static gsf_result gsf__clip_part(gsf_context* ctx, gsf__clip* c, int32_t part) {
     gsf_restore_window w = *c->window;
     const int32_t begin = gsf__clip_spread(part, c->parts, c->window->frame_count - c->taken + 1);
+    c->begin = begin;
     GSF__TRY(gsf__clip_take(ctx, c, begin));
+    if (w.carry_fn) {
+        w.carry_fn = gsf__clip_carry;
+        w.carry_user = c;
+    }
     w.frame_count = c->shown;
     w.color = c->color;
     w.depth = w.depth ? c->depth : NULL;
@@ -4655,9 +4731,14 @@ static gsf_result gsf__clip_part(gsf_context* ctx, gsf__clip* c, int32_t part) {
 
 GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer, const gsf_restore_window* window) {
     gsf__clip c;
-    if (window->struct_size < sizeof *window || window->frame_count < 1 || !window->color || !window->out_color ||
+    gsf_restore_window complete; // with the fields that an older host's window lacks
+    if (window->struct_size < GSF__WINDOW_BYTES || window->frame_count < 1 || !window->color || !window->out_color ||
         !window->out_confidence)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "clip: no frames, or struct_size is missing");
+    memset(&complete, 0, sizeof complete);
+    memcpy(&complete, window, window->struct_size < sizeof complete ? (size_t)GSF__WINDOW_BYTES : sizeof complete);
+    complete.struct_size = sizeof complete;
+    window = &complete;
     memset(&c, 0, sizeof c);
     c.restorer = restorer;
     c.window = window;
@@ -4685,6 +4766,7 @@ GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restor
         result = gsf__clip_part(ctx, &c, part);
         gsf__clip_drop_frames(ctx, &c);
     }
+    for (int k = 0; k < GSF__CARRIED_IMAGES; k++) gsf_destroy_image(ctx, &c.carried[k]);
     gsf_free(ctx, c.color);
     gsf_free(ctx, c.cameras);
     gsf_free(ctx, c.reference_index);

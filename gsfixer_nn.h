@@ -14432,7 +14432,7 @@ static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r, const
 }
 
 static int32_t gsf__dit_clip_number(const gsf_restore_window* window) { // 0 if the host's struct lacks this member
-    return window->struct_size >= sizeof *window ? window->clip : 0;
+    return window->struct_size >= GSF__WINDOW_BYTES ? window->clip : 0;
 }
 
 static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
@@ -14497,7 +14497,7 @@ static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const 
 // Each part of a clip has a checkpoint of its own, so that finished parts are not sampled again.
 static gsf_result gsf__dit_checkpoint(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
                                       gsf_buffer* path, gsf_nn_sample_desc* d) {
-    if (!d->checkpoint || window->struct_size < sizeof *window || !window->part) return GSF_OK;
+    if (!d->checkpoint || window->struct_size < GSF__WINDOW_BYTES || !window->part) return GSF_OK;
     gsf_append_text(ctx, path, "%s.%d", r->desc.sample.checkpoint, (int)window->part);
     d->checkpoint = path->data;
     return path->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;

@@ -37,6 +37,7 @@
                                                                    | gsf_splat_render_trainer                      |
                                                                    v                                               |
          gsf_fixer:  path (gsfixer_traj.h) ------> frames of a window: colour, depth, alpha ------> gsf_restorer --'
+                     photos -> stereo, exposure (once) -> scores (every round) -> what they show in a frame -^  (>>carry)
 
    STEP BY STEP
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
@@ -83,6 +84,9 @@
                         help of --restorer, gsfix_check_restorer, gsfix_make_restorer, gsfix_destroy_restorer (`none` is
                         NULL) and, if `gsfix restore` can lack its inputs, a check like check_warp_clip. The list in
                         README.md. Tests: tests/test_fixer.c, tests/test_gsfix.sh
+       what photos show in a frame    a member of gsf_carried (gsfixer.h), its place in gsf__list_carried, and in >>carry
+                        gsf__carry_row, which fills it in. What makes a pixel more or less certain: gsf__carry_score_row.
+                        Tests: tests/test_carry.c
        a start          gsf_initial_kind, in >>few views
 
    ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
@@ -91,8 +95,12 @@
    MEMORY      Everything comes from the context's allocator, except scratch memory of Embree and stb. A trainer takes about
                1 kB per splat of SH degree 3 and, per pixel of a photo, 3 bytes (u8) or 12 (f32), and 4 more with a weight.
                The repair loop holds no other copy: while a round begins the restorer is shown photos as floats (with the
-               splats' render and depth 28 bytes per pixel); `warp` keeps 20 bytes per pixel until the round ends (29 of
-               photos that are not 8-bit or have masks). A restored frame takes 7 bytes per pixel while it is trained on.
+               splats' render and depth 28 bytes per pixel). For `warp`, and any restorer that asks for carried photos, it
+               keeps 20 bytes per pixel of the photos until the round ends (29 if they are not 8-bit or have masks; as much
+               again for `warp` until its first window), and until the run ends 4 bytes per pixel of their depth maps, at
+               most 320 pixels long; a frame takes 4 bytes per pixel and reference, 52 more if it is handed out. Stereo, once
+               per run, takes 80 bytes per pixel of its working size while it runs.
+               A restored frame takes 7 bytes per pixel while it is trained on.
                Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
@@ -102,7 +110,7 @@
                convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
-               >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer >>few views
+               >>render >>loss >>adam >>densify >>trainer >>carry >>warp >>seen mask >>fixer >>few views
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -577,10 +585,13 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 
 // ---- restorers -----------------------------------------------------------------
 
-// Training-free restorer: reprojects the residual of the reference photos (photo - render) through the splats' depth
-// with occlusion tests, blends by confidence, and adds it to the frame; where no reference sees a pixel, the render is
-// kept. Floaters, identified by two references that see through them, are replaced by the photos behind them. For
-// references without a render, the photos themselves are reprojected. Fills *out; out->user is freed by
+// Training-free restorer: shows in a frame what the reference photos show of it. Where other photos confirm depth and
+// colour, the photos' colours replace a render that shows another depth, and the residual (photo - render at the photo's
+// camera) is added in full to one that agrees; where only the splats vouch for the depth, the residual is added with less
+// weight and less confidence; where no reference sees
+// a pixel, the render is kept with confidence 0. Floaters, identified by two references that see through them, are
+// replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
+// splats. Without renders of the references, colours are taken everywhere. Fills *out; out->user is freed by
 // gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
@@ -11330,28 +11341,24 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
     return gsf__trainer_show(NULL, (gsf_trainer*)trainer);
 }
 
-// ---- >>warp --------------------------------------------------------------------
+// ---- >>carry -------------------------------------------------------------------
 
-/* Training-free restorer: restored = render + residual. The residual, photo - render at the photo's own camera, is
-   what the splats do not yet explain of a photo; it is warped to the novel frame. Warping the photo itself would also
-   transfer its exposure and view-dependent shading, and displace all detail by the depth error. Measured on real
-   photos (a third of the way through training, held-out views, 3/6/9 photos), frames of warped photos are 1.2/1.6/2.6
-   dB worse than the render, frames with warped residuals 0.3/0.7/0.8 dB better. Floaters are the exception, since a
-   residual would keep them: where two references look through the surface that the frame shows and none sees it there,
-   the photos are warped (squared error of these pixels at 3/6/9 photos, held-out views: 0.51/0.68/0.85 of the
-   render's). The geometry is the references' own depth maps, rendered from the splats, so floaters in front of the
-   novel camera do not affect it.
-       begin     per reference: a score per pixel from the other references. A point that another reference sees at the
-                 same depth is supported. A point in front of the surface that another reference sees is refuted,
-                 because that reference looks through it (free-space violation).
-       restore   per frame: the depth maps of the nearest references, cut at depth edges, are rasterized as triangle
-                 meshes into z-buffers of the frame. Per pixel, the candidates are grouped by depth, and the nearest
-                 group with enough weight wins (occlusion). Its residuals are blended, weighted by score and angle, or,
-                 if the frame shows a floater in front of it, its colours, with confidence 1. Pixels that no reference
-                 reaches keep the render and get confidence 0, so they are not trained on.
-   If a reference has no render, the photos themselves are warped. */
+/* Carries photos into other views: what a reference shows in a frame is found through the reference's own depth map, so
+   that floaters in front of the frame's camera do not matter.
+       study     once per run: depth maps of the photos by stereo between them, and the exposure of each photo relative to
+                 their mean. Depends only on photos, cameras and the points that guide the search, so that a resumed run
+                 finds the same again.
+       open      once per round, with the splats' renders: the depth of a reference is that of stereo or, where stereo is
+                 silent, that of the splats. Every pixel gets a score from the other references: do they show a surface at
+                 that depth, do their photos look alike around it, does one look through it (free-space violation)?
+       draw      per frame and reference: the depth map, cut at depth edges, is rasterized as a triangle mesh into a z-buffer
+                 of the frame. A pixel's depth there gives its position in the reference, and so all else.
+   A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to
+   one exposure per frame: that of the photos around it, since exposure and shading change gradually along a capture,
+   and since the frame would otherwise contradict the photos near it. Residuals (photo - render) are not: the splats
+   follow each photo's own exposure. */
 
-typedef struct gsf__warp_reference {
+typedef struct gsf__carry_reference {
     gsf_camera camera;
     double center[3];
     double focus[3]; // world point at the image centre, at the mean inverse depth
@@ -11361,49 +11368,63 @@ typedef struct gsf__warp_reference {
     float* residual; // (H,W,3): colour - render; NULL without renders
     float* depth;    // (H,W), 0 = no surface
     uint8_t* score;  // (H,W), percent
-} gsf__warp_reference;
+} gsf__carry_reference;
 
-typedef struct gsf__warp {
-    gsf__warp_reference* references;
+typedef struct gsf__carry_study { // of one photo
+    int32_t width, height;      // of the depth map
+    float* depth;               // (height,width) where stereo confirms it, else 0; NULL = none
+    float gain[3], offset[3];   // colour of the mean exposure = gain * colour + offset
+} gsf__carry_study;
+
+typedef struct gsf__carrier {
+    int32_t study_count;
+    gsf__carry_study* studies;        // of the run; NULL before gsf__carrier_study
     int32_t count;
+    gsf__carry_reference* references; // of the round; NULL unless open
     int has_residuals;
-} gsf__warp;
+    float gain[3], offset[3];         // what brings the exposure of the frame that was drawn last to the mean
+    float* inv_z;                     // scratch for one frame: z-buffers, one per slot
+    void* vertices;                   // of one reference, and for each of its rows the range of their positions
+    size_t inv_z_capacity, vertex_capacity;
+} gsf__carrier;
 
-#define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative depth difference up to which points lie on the same surface
-#define GSF__WARP_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
-#define GSF__WARP_ANGLE 0.2f            // radians: a reference whose viewing direction differs by this weighs exp(-1/2)
-#define GSF__WARP_GROUP_SHARE 0.35f     // share of the heaviest group's weight that a nearer group needs to occlude it
-#define GSF__WARP_TRUST 0.5f            // total weight below which a residual is attenuated
-#define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
-#define GSF__WARP_BEHIND_MAX 2.0f
-#define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
-enum { GSF__WARP_NEAREST = 4 };         // number of references warped per frame
+#define GSF__CARRY_DEPTH_TOLERANCE 0.04f // relative depth difference up to which points lie on the same surface
+#define GSF__CARRY_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
+enum {
+    GSF__CARRY_VERIFIED = 50,  // score from which depth and colour are confirmed by another photo
+    GSF__CARRY_ALIKE = 50,     // percent: likeness from which windows of two photos show the same
+    GSF__CARRY_WINDOW = 3,     // radius of the windows that are compared between photos
+    GSF__CARRY_BAND = 16,      // rows of a frame that are drawn together
+    GSF__CARRY_OTHERS = 8,     // most references that judge another one
+    GSF__CARRY_LEVELS = 6,     // of the pyramid that corrects the splats' depth
+    GSF__CARRY_SLOTS = 9,      // most references that are ranked
+    GSF__CARRY_STEREO_SIZE = 320, // most pixels along a side that stereo works with
+};
 
-static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
-                                  gsf_restorer_info* out) {
-    const gsf__warp* warp = (const gsf__warp*)user;
-    (void)ctx;
-    out->needs_depth = 1;
-    out->explains = 1;
-    const int32_t count = warp->count > 0 ? warp->count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
-    out->bytes = (double)width * height * (20.0 * count + 4.0 * drawn);
-    out->flops = (double)width * height * frame_count * 200.0 * drawn;
-    return GSF_OK;
-}
-
-static void gsf__warp_end(void* user, gsf_context* ctx) {
-    gsf__warp* warp = (gsf__warp*)user;
-    for (int32_t i = 0; i < warp->count; i++) {
-        gsf__warp_reference* ref = warp->references + i;
+static void gsf__carrier_close(gsf_context* ctx, gsf__carrier* carrier) {
+    for (int32_t i = 0; i < carrier->count; i++) {
+        gsf__carry_reference* ref = carrier->references + i;
         gsf_free(ctx, ref->bytes);
         gsf_free(ctx, ref->color);
         gsf_free(ctx, ref->residual);
         gsf_free(ctx, ref->depth);
         gsf_free(ctx, ref->score);
     }
-    gsf_free(ctx, warp->references);
-    warp->references = NULL;
-    warp->count = 0;
+    gsf_free(ctx, carrier->references);
+    gsf_free(ctx, carrier->inv_z);
+    gsf_free(ctx, carrier->vertices);
+    carrier->references = NULL;
+    carrier->inv_z = NULL;
+    carrier->vertices = NULL;
+    carrier->inv_z_capacity = carrier->vertex_capacity = 0;
+    carrier->count = 0;
+}
+
+static void gsf__carrier_forget(gsf_context* ctx, gsf__carrier* carrier) { // closes it, too
+    gsf__carrier_close(ctx, carrier);
+    for (int32_t i = 0; i < carrier->study_count; i++) gsf_free(ctx, carrier->studies[i].depth);
+    gsf_free(ctx, carrier->studies);
+    memset(carrier, 0, sizeof *carrier);
 }
 
 // World point at image position (x,y) and camera depth z.
@@ -11452,48 +11473,283 @@ static float gsf__sample_bytes(const uint8_t* plane, size_t channels, size_t cha
     return gsf__blend_taps(taps, v);
 }
 
-static float gsf__sample_color(const gsf__warp_reference* ref, size_t channel, const gsf__taps* taps) {
-    return ref->bytes ? gsf__sample_bytes(ref->bytes, 3, channel, 255.0, taps)
-                      : gsf__sample_floats(ref->color, 3, channel, taps);
-}
-
 // Depth of the pixel that contains a continuous position; 0 outside the image.
-static float gsf__nearest_depth(const gsf__warp_reference* ref, double u, double v) {
+static float gsf__nearest_depth(const gsf__carry_reference* ref, double u, double v) {
     if (!(u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height)) return 0.0f;
     return ref->depth[(size_t)v * (size_t)ref->camera.width + (size_t)u];
 }
 
-typedef struct gsf__warp_score_job {
-    const gsf__warp* warp;
-    int32_t reference;
-} gsf__warp_score_job;
+static float gsf__photo_color(const gsf__carry_reference* ref, size_t channel, const gsf__taps* taps) {
+    return ref->bytes ? gsf__sample_bytes(ref->bytes, 3, channel, 255.0, taps)
+                      : gsf__sample_floats(ref->color, 3, channel, taps);
+}
 
-static void gsf__warp_score_row(void* arg, size_t row, int32_t worker) {
-    (void)worker;
-    const gsf__warp_score_job* job = (const gsf__warp_score_job*)arg;
-    const gsf__warp_reference* ref = job->warp->references + job->reference;
-    for (int32_t x = 0; x < ref->camera.width; x++) {
-        const size_t at = row * (size_t)ref->camera.width + (size_t)x;
-        ref->score[at] = 0;
-        if (!(ref->depth[at] > 0.0f)) continue;
-        double point[3];
-        gsf__unproject(&ref->camera, x + 0.5, (double)row + 0.5, (double)ref->depth[at], point);
-        int support = 0, refuted = 0;
-        for (int32_t k = 0; k < job->warp->count; k++) {
-            const gsf__warp_reference* other = job->warp->references + k;
-            double u, v, z;
-            if (k == job->reference || !gsf_project_point(&other->camera, point, &u, &v, &z)) continue;
-            const float seen = gsf__nearest_depth(other, u, v);
-            if (!(seen > 0.0f)) continue;
-            const float off = (float)z / seen - 1.0f;
-            support += fabsf(off) <= GSF__WARP_DEPTH_TOLERANCE;
-            refuted += off < -2.0f * GSF__WARP_DEPTH_TOLERANCE;
+static float gsf__carry_expose_value(const gsf__carrier* carrier, int32_t reference, size_t channel, float value) {
+    if (reference >= carrier->study_count) return value;
+    value = carrier->studies[reference].gain[channel] * value + carrier->studies[reference].offset[channel];
+    value = (value - carrier->offset[channel]) / carrier->gain[channel];
+    return value > 1.0f ? 1.0f : value > 0.0f ? value : 0.0f;
+}
+
+// A channel of the photo at the exposure of the frame.
+static float gsf__carry_color(const gsf__carrier* carrier, int32_t reference, size_t channel, const gsf__taps* taps) {
+    return gsf__carry_expose_value(carrier, reference, channel,
+                                   gsf__photo_color(carrier->references + reference, channel, taps));
+}
+
+static void gsf__carry_pixel(const gsf__carrier* carrier, int32_t reference, size_t at, float rgb[3]) { // the same, of a pixel
+    const gsf__carry_reference* ref = carrier->references + reference;
+    for (size_t c = 0; c < 3; c++)
+        rgb[c] = gsf__carry_expose_value(carrier, reference, c,
+                                         ref->bytes ? (float)(ref->bytes[3 * at + c] / 255.0) : ref->color[3 * at + c]);
+}
+
+// Finds the (at most `most`) references whose viewing direction to their focus is closest to that of a camera at `center`.
+// Ties go to the lower index. Returns their number.
+static int gsf__carry_nearest(const gsf__carrier* carrier, const double center[3], int32_t* nearest, int most) {
+    double best[GSF__CARRY_SLOTS];
+    int count = 0;
+    for (int32_t k = 0; k < carrier->count; k++) {
+        const double cosine = gsf__ray_cosine(carrier->references[k].focus, center, carrier->references[k].center);
+        int at = count < most ? count++ : most;
+        for (; at > 0 && best[at - 1] < cosine; at--)
+            if (at < most) {
+                best[at] = best[at - 1];
+                nearest[at] = nearest[at - 1];
+            }
+        if (at < most) {
+            best[at] = cosine;
+            nearest[at] = k;
         }
-        ref->score[at] = (uint8_t)(support > refuted ? 100 : refuted > support ? 10 : 50);
+    }
+    return count;
+}
+
+// Sets the exposure of a frame at `center` (NULL: the mean): that of the references, weighted by the inverse of the squared
+// angle between their viewing directions and the frame's.
+static void gsf__carry_set_exposure(gsf__carrier* carrier, const double* center) {
+    double gain[3] = {0.0, 0.0, 0.0}, offset[3] = {0.0, 0.0, 0.0}, total = 0.0;
+    int32_t nearest[GSF__CARRY_SLOTS];
+    const int count = center && carrier->study_count ? gsf__carry_nearest(carrier, center, nearest, GSF__CARRY_SLOTS) : 0;
+    for (int k = 0; k < count; k++) {
+        const gsf__carry_reference* ref = carrier->references + nearest[k];
+        const gsf__carry_study* study = carrier->studies + nearest[k];
+        const double weight = 1.0 / (fmax(0.0, 1.0 - gsf__ray_cosine(ref->focus, center, ref->center)) + 1e-4);
+        total += weight;
+        for (int c = 0; c < 3; c++) {
+            gain[c] += weight * (double)study->gain[c];
+            offset[c] += weight * (double)study->offset[c];
+        }
+    }
+    for (int c = 0; c < 3; c++) {
+        carrier->gain[c] = count ? (float)(gain[c] / total) : 1.0f;
+        carrier->offset[c] = count ? (float)(offset[c] / total) : 0.0f;
     }
 }
 
-static void gsf__warp_find_focus(gsf__warp_reference* ref) { // middle pixel at the mean inverse depth
+// ---- what depends only on the photos
+
+// A pixel of a photo of any layout with dtype u8 or f32, as 0..1, interpolated.
+static void gsf__carry_photo_color(const gsf_image* photo, const gsf__taps* taps, float rgb[3]) {
+    for (int c = 0; c < 3; c++) {
+        float v[4];
+        for (int k = 0; k < 4; k++) {
+            const int64_t x = (int64_t)taps->at[k] % photo->width, y = (int64_t)taps->at[k] / photo->width;
+            const char* at = (const char*)photo->data + y * photo->stride_y + x * photo->stride_x + c * photo->stride_c;
+            if (photo->dtype == GSF_U8) v[k] = (float)*(const uint8_t*)at / 255.0f;
+            else memcpy(v + k, at, sizeof *v);
+        }
+        rgb[c] = gsf__blend_taps(taps, v);
+    }
+}
+
+typedef struct gsf__carry_pair { // the same point in two photos
+    int32_t photo[2];
+    float rgb[2][3];
+    float share;  // weight: pairs of one two photos count as much as GSF__CARRY_EVIDENCE of them
+} gsf__carry_pair;
+
+typedef struct gsf__carry_pairs {
+    gsf__carry_pair* pairs;
+    size_t count, capacity;
+} gsf__carry_pairs;
+
+enum { GSF__CARRY_EVIDENCE = 10, GSF__CARRY_SWEEPS = 60 };
+
+// Adds points that the stereo depth maps of photos i and k agree on.
+static gsf_result gsf__carry_match(gsf_context* ctx, const gsf__carrier* carrier, const gsf_scene_view* views, int32_t i,
+                                   int32_t k, gsf__carry_pairs* out) {
+    const gsf__carry_study *a = carrier->studies + i, *b = carrier->studies + k;
+    const gsf_camera from = gsf_resize_camera(&views[i].camera, a->width, a->height);
+    const gsf_camera to = gsf_resize_camera(&views[k].camera, b->width, b->height);
+    const size_t before = out->count;
+    for (int32_t y = 1; y < a->height; y += 3)
+        for (int32_t x = 1; x < a->width; x += 3) {
+            const float depth = a->depth[(size_t)y * (size_t)a->width + (size_t)x];
+            double point[3], u, v, z;
+            if (!(depth > 0.0f)) continue;
+            gsf__unproject(&from, x + 0.5, y + 0.5, (double)depth, point);
+            if (!gsf_project_point(&to, point, &u, &v, &z) || !(u >= 0.0 && v >= 0.0 && u < b->width && v < b->height))
+                continue;
+            const float there = b->depth[(size_t)v * (size_t)b->width + (size_t)u];
+            if (!(there > 0.0f && fabs(z - (double)there) <= 0.02 * z)) continue;
+            gsf__carry_pair pair;
+            gsf__taps taps;
+            int usable = 1;
+            for (int side = 0; side < 2; side++) {
+                const gsf_scene_view* view = views + (side ? k : i);
+                const gsf__carry_study* study = side ? b : a;
+                const double sx = (double)view->camera.width / study->width, sy = (double)view->camera.height / study->height;
+                pair.photo[side] = side ? k : i;
+                usable &= gsf__find_taps(&view->camera, (side ? u : x + 0.5) * sx, (side ? v : y + 0.5) * sy, &taps);
+                if (!usable) break;
+                gsf__carry_photo_color(&view->image, &taps, pair.rgb[side]);
+                for (int c = 0; c < 3; c++) usable &= pair.rgb[side][c] > 0.02f && pair.rgb[side][c] < 0.98f; // not clipped
+            }
+            if (!usable) continue;
+            GSF__TRY(gsf__reserve(ctx, (void**)&out->pairs, &out->capacity, out->count, out->count + 1, sizeof *out->pairs));
+            out->pairs[out->count++] = pair;
+        }
+    const float n = (float)(out->count - before);
+    for (size_t p = before; p < out->count; p++)
+        out->pairs[p].share = n > (float)GSF__CARRY_EVIDENCE ? (float)GSF__CARRY_EVIDENCE / n : 1.0f;
+    return GSF_OK;
+}
+
+// One sweep of the fit of a channel: every photo's gain and offset against those of its partners as they are. The loss is
+// that of Geman and McClure with a scale of 0.06, since highlights and wrong matches differ by more. Priors: gains within
+// 0.15 of 1, offsets within 0.015 of 0, for residuals of 0.03. sums: (photos,5), scratch.
+static void gsf__carry_fit(gsf__carrier* carrier, const gsf__carry_pairs* pairs, int channel, double* sums) {
+    memset(sums, 0, (size_t)carrier->study_count * 5 * sizeof *sums);
+    for (size_t p = 0; p < pairs->count; p++) {
+        const gsf__carry_pair* pair = pairs->pairs + p;
+        double corrected[2];
+        for (int side = 0; side < 2; side++) {
+            const gsf__carry_study* study = carrier->studies + pair->photo[side];
+            corrected[side] = (double)(study->gain[channel] * pair->rgb[side][channel] + study->offset[channel]);
+        }
+        const double off = (corrected[0] - corrected[1]) / 0.06, robust = 1.0 / (1.0 + off * off);
+        const double weight = (double)pair->share * robust * robust;
+        for (int side = 0; side < 2; side++) {
+            double* sum = sums + 5 * (size_t)pair->photo[side];
+            const double a = (double)pair->rgb[side][channel], target = corrected[1 - side];
+            sum[0] += weight * a * a;
+            sum[1] += weight * a;
+            sum[2] += weight;
+            sum[3] += weight * a * target;
+            sum[4] += weight * target;
+        }
+    }
+    double log_gain = 0.0, offset = 0.0;
+    for (int32_t i = 0; i < carrier->study_count; i++) {
+        gsf__carry_study* study = carrier->studies + i;
+        const double* sum = sums + 5 * (size_t)i;
+        const double gain_prior = 0.03 * 0.03 / (0.15 * 0.15), offset_prior = 0.03 * 0.03 / (0.015 * 0.015);
+        const double aa = sum[0] + gain_prior, bb = sum[2] + offset_prior, ab = sum[1], det = aa * bb - ab * ab;
+        const double at = sum[3] + gain_prior, bt = sum[4];
+        const double gain = (at * bb - bt * ab) / det, shift = (aa * bt - ab * at) / det;
+        study->gain[channel] += 0.5f * ((float)(gain < 0.25 ? 0.25 : gain > 4.0 ? 4.0 : gain) - study->gain[channel]);
+        study->offset[channel] += 0.5f * ((float)shift - study->offset[channel]);
+        log_gain += log((double)study->gain[channel]) / carrier->study_count;
+        offset += (double)study->offset[channel] / carrier->study_count;
+    }
+    const float scale = (float)exp(-log_gain);
+    for (int32_t i = 0; i < carrier->study_count; i++) {
+        carrier->studies[i].gain[channel] *= scale;
+        carrier->studies[i].offset[channel] = (carrier->studies[i].offset[channel] - (float)offset) * scale;
+    }
+}
+
+#define GSF__CARRY_STEP 0.01f // deviation of gain and offset up to which a photo counts as of the mean exposure
+
+// Exposure of the photos relative to their mean. Photos without evidence, and all if no two overlap, keep the identity.
+static gsf_result gsf__carry_expose(gsf_context* ctx, gsf__carrier* carrier, const gsf_scene_view* views) {
+    gsf__carry_pairs pairs;
+    memset(&pairs, 0, sizeof pairs);
+    gsf_result result = GSF_OK;
+    double* sums = (double*)gsf_alloc(ctx, (size_t)carrier->study_count, 5 * sizeof *sums);
+    if (!sums) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < carrier->study_count; i++)
+        for (int32_t k = i + 1; k < carrier->study_count && k <= i + GSF__CARRY_OTHERS && result == GSF_OK; k++)
+            if (carrier->studies[i].depth && carrier->studies[k].depth)
+                result = gsf__carry_match(ctx, carrier, views, i, k, &pairs);
+    for (int sweep = 0; sweep < GSF__CARRY_SWEEPS && pairs.count && result == GSF_OK; sweep++)
+        for (int c = 0; c < 3; c++) gsf__carry_fit(carrier, &pairs, c, sums);
+    for (int32_t i = 0; i < carrier->study_count; i++) {
+        gsf__carry_study* study = carrier->studies + i;
+        int step = 0;
+        for (int c = 0; c < 3; c++)
+            step |= fabsf(study->gain[c] - 1.0f) > GSF__CARRY_STEP || fabsf(study->offset[c]) > GSF__CARRY_STEP;
+        for (int c = 0; c < 3 && !step; c++) {
+            study->gain[c] = 1.0f;
+            study->offset[c] = 0.0f;
+        }
+    }
+    gsf_free(ctx, pairs.pairs);
+    gsf_free(ctx, sums);
+    return result;
+}
+
+static gsf_result gsf__carry_keep_maps(gsf_context* ctx, gsf__carrier* carrier, const gsf_dense* dense) {
+    for (size_t m = 0; m < dense->map_count; m++) {
+        const gsf_dense_map* map = dense->maps + m;
+        gsf__carry_study* study = carrier->studies + map->view;
+        const size_t pixels = (size_t)map->camera.width * (size_t)map->camera.height;
+        study->depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
+        if (!study->depth) return GSF_ERROR_OUT_OF_MEMORY;
+        memcpy(study->depth, map->depth, pixels * sizeof(float));
+        study->width = map->camera.width;
+        study->height = map->camera.height;
+    }
+    return GSF_OK;
+}
+
+// views: photos (u8 or f32, 3 channels) and cameras; weight as in a scene. points: (point_count,3) world, which guide the
+// search for depths; may be none. After an error the carrier has no studies.
+static gsf_result gsf__carrier_study(gsf_context* ctx, gsf__carrier* carrier, gsf_scene_view* views, int32_t count,
+                                     double* points, size_t point_count, uint64_t seed) {
+    gsf_dense_desc desc;
+    gsf_dense dense;
+    gsf_scene scene;
+    memset(&desc, 0, sizeof desc);
+    memset(&dense, 0, sizeof dense);
+    memset(&scene, 0, sizeof scene);
+    carrier->studies = (gsf__carry_study*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof *carrier->studies);
+    uint32_t* order = (uint32_t*)gsf_alloc(ctx, (size_t)count, sizeof *order);
+    scene.track_begin = (size_t*)gsf_alloc_zeroed(ctx, point_count + 1, sizeof *scene.track_begin);
+    gsf_result result = carrier->studies && order && scene.track_begin ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (carrier->studies) carrier->study_count = count;
+    for (int32_t i = 0; i < count && result == GSF_OK; i++) {
+        order[i] = (uint32_t)i;
+        for (int c = 0; c < 3; c++) carrier->studies[i].gain[c] = 1.0f;
+    }
+    scene.view_count = (size_t)count;
+    scene.views = views;
+    scene.points = points;
+    scene.point_count = point_count;
+    desc.seed = seed;
+    desc.want_maps = 1;
+    desc.spacing = 1024; // the points are not needed
+    desc.max_size = GSF__CARRY_STEREO_SIZE;
+    desc.max_cost = 0.5f;      // more than for points that splats are made of: the score also compares the photos
+    desc.max_cost_many = 0.6f;
+    int large = count > 1;
+    for (int32_t i = 0; i < count; i++)
+        large &= views[i].camera.width >= GSF__DENSE_MIN_SIDE && views[i].camera.height >= GSF__DENSE_MIN_SIDE;
+    if (result == GSF_OK && large) // its windows would fill a smaller photo
+        result = gsf_splat_make_dense(ctx, &scene, order, (size_t)count, NULL, &desc, &dense, NULL);
+    if (result == GSF_OK) result = gsf__carry_keep_maps(ctx, carrier, &dense);
+    if (result == GSF_OK) result = gsf__carry_expose(ctx, carrier, views);
+    gsf_splat_destroy_dense(ctx, &dense);
+    gsf_free(ctx, scene.track_begin);
+    gsf_free(ctx, order);
+    if (result != GSF_OK) gsf__carrier_forget(ctx, carrier);
+    return result;
+}
+
+// ---- references of a round
+
+static void gsf__carry_find_focus(gsf__carry_reference* ref) { // middle pixel at the mean inverse depth
     const size_t pixels = (size_t)ref->camera.width * (size_t)ref->camera.height;
     double sum = 0.0, count = 0.0;
     for (size_t p = 0; p < pixels; p++)
@@ -11505,8 +11761,8 @@ static void gsf__warp_find_focus(gsf__warp_reference* ref) { // middle pixel at 
                    ref->focus);
 }
 
-// Copies a reference. What it allocates is freed by gsf__warp_end, also after an error.
-static gsf_result gsf__warp_take(gsf_context* ctx, const gsf_reference* from, int has_residuals, gsf__warp_reference* ref) {
+// Copies a reference. What it allocates is freed by gsf__carrier_close, also after an error.
+static gsf_result gsf__carry_take(gsf_context* ctx, const gsf_reference* from, int has_residuals, gsf__carry_reference* ref) {
     const gsf_camera* camera = &from->camera;
     GSF__TRY(gsf_check_camera(ctx, camera));
     const int32_t width = camera->width, height = camera->height;
@@ -11517,7 +11773,7 @@ static gsf_result gsf__warp_take(gsf_context* ctx, const gsf_reference* from, in
     ref->color = (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float));
     ref->residual = has_residuals ? (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float)) : NULL;
     ref->depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
-    ref->score = (uint8_t*)gsf_alloc(ctx, pixels, 1);
+    ref->score = (uint8_t*)gsf_alloc_zeroed(ctx, pixels, 1);
     if (!ref->bytes || !ref->color || (has_residuals && !ref->residual) || !ref->depth || !ref->score)
         return GSF_ERROR_OUT_OF_MEMORY;
     const gsf_image color = gsf_wrap_image(ref->color, GSF_F32, width, height, 3);
@@ -11540,52 +11796,285 @@ static gsf_result gsf__warp_take(gsf_context* ctx, const gsf_reference* from, in
         gsf_free(ctx, ref->bytes);
         ref->bytes = NULL;
     }
-    gsf__warp_find_focus(ref);
+    gsf__carry_find_focus(ref);
     return GSF_OK;
 }
 
-static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
-    gsf__warp* warp = (gsf__warp*)user;
-    if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
-    if (warp->references) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: in use by a run that has not ended");
-    for (int32_t i = 0; i < count; i++)
-        if (!references[i].color.data || !references[i].depth.data)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
-    warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
-    if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
-    warp->count = count;
-    warp->has_residuals = 1;
-    for (int32_t i = 0; i < count; i++) warp->has_residuals &= references[i].render.data != NULL;
-    for (int32_t i = 0; i < count; i++) {
-        const gsf_result result = gsf__warp_take(ctx, references + i, warp->has_residuals, warp->references + i);
-        if (result == GSF_OK) continue;
-        gsf__warp_end(user, ctx);
-        return result;
+// Depth that stereo confirms at a pixel of the photo, 0 = none. A map that is smaller than the photo is interpolated in
+// inverse depth where all four neighbours lie on one surface.
+static float gsf__carry_stereo_depth(const gsf__carry_study* study, const gsf_camera* camera, int32_t x, int32_t y) {
+    if (!study->depth) return 0.0f;
+    if (study->width == camera->width && study->height == camera->height)
+        return study->depth[(size_t)y * (size_t)study->width + (size_t)x];
+    gsf_camera map;
+    gsf__taps taps;
+    float v[4], lo = INFINITY, hi = 0.0f;
+    memset(&map, 0, sizeof map);
+    map.width = study->width;
+    map.height = study->height;
+    const double u = (x + 0.5) * study->width / camera->width, w = (y + 0.5) * study->height / camera->height;
+    if (!gsf__find_taps(&map, u, w, &taps)) return 0.0f;
+    for (int k = 0; k < 4; k++) {
+        const float depth = study->depth[taps.at[k]];
+        if (depth < lo) lo = depth;
+        if (depth > hi) hi = depth;
+        v[k] = depth > 0.0f ? 1.0f / depth : 0.0f;
     }
-    for (int32_t i = 0; i < count; i++) {
-        gsf__warp_score_job job;
-        job.warp = warp;
+    if (lo > 0.0f && hi <= lo * GSF__CARRY_EDGE) return 1.0f / gsf__blend_taps(&taps, v);
+    return study->depth[(size_t)w * (size_t)study->width + (size_t)u];
+}
+
+// ---- scores
+
+typedef struct gsf__carry_score_job {
+    const gsf__carrier* carrier;
+    const float* const* grey;  // per reference: (H,W), of the mean exposure
+    int32_t reference, other;  // the one that is judged, and by which
+    float* seen;               // (H,W) grey of the other photo at the pixel's point
+    uint8_t* relation;         // (H,W) GSF__CARRY_NONE...
+    uint8_t *support, *refuted, *alike; // (H,W): how many others agree, how many look through, percent of likeness
+    const uint8_t* stereo;     // (H,W): whether the depth is that of stereo
+} gsf__carry_score_job;
+
+enum { GSF__CARRY_NONE = 0, GSF__CARRY_AGREES, GSF__CARRY_THROUGH, GSF__CARRY_HIDDEN };
+
+static void gsf__carry_look_row(void* arg, size_t row, int32_t worker) { // fills in `seen` and `relation`
+    (void)worker;
+    const gsf__carry_score_job* job = (const gsf__carry_score_job*)arg;
+    const gsf__carry_reference *ref = job->carrier->references + job->reference, *other = job->carrier->references + job->other;
+    for (int32_t x = 0; x < ref->camera.width; x++) {
+        const size_t at = row * (size_t)ref->camera.width + (size_t)x;
+        double point[3], u, v, z;
+        gsf__taps taps;
+        job->relation[at] = GSF__CARRY_NONE;
+        if (!(ref->depth[at] > 0.0f)) continue;
+        gsf__unproject(&ref->camera, x + 0.5, (double)row + 0.5, (double)ref->depth[at], point);
+        if (!gsf_project_point(&other->camera, point, &u, &v, &z)) continue;
+        const float shown = gsf__nearest_depth(other, u, v);
+        if (!(shown > 0.0f) || !gsf__find_taps(&other->camera, u, v, &taps)) continue;
+        const float off = (float)z / shown - 1.0f;
+        job->seen[at] = gsf__sample_floats(job->grey[job->other], 1, 0, &taps);
+        job->relation[at] = (uint8_t)(fabsf(off) <= GSF__CARRY_DEPTH_TOLERANCE         ? GSF__CARRY_AGREES
+                                      : off < -2.0f * GSF__CARRY_DEPTH_TOLERANCE ? GSF__CARRY_THROUGH
+                                                                                  : GSF__CARRY_HIDDEN);
+    }
+}
+
+// How alike the two photos are around a pixel, over the pixels whose depths agree: 0..100. Windows without texture are alike
+// if their brightness is.
+static int gsf__carry_likeness(const gsf__carry_score_job* job, int32_t x, int32_t y) {
+    const gsf_camera* camera = &job->carrier->references[job->reference].camera;
+    const float* grey = job->grey[job->reference];
+    float n = 0.0f, a = 0.0f, b = 0.0f, aa = 0.0f, bb = 0.0f, ab = 0.0f;
+    for (int32_t v = y - GSF__CARRY_WINDOW; v <= y + GSF__CARRY_WINDOW; v++)
+        for (int32_t u = x - GSF__CARRY_WINDOW; u <= x + GSF__CARRY_WINDOW; u++) {
+            if (u < 0 || v < 0 || u >= camera->width || v >= camera->height) continue;
+            const size_t at = (size_t)v * (size_t)camera->width + (size_t)u;
+            if (job->relation[at] != GSF__CARRY_AGREES) continue;
+            const float p = grey[at], q = job->seen[at];
+            n += 1.0f;
+            a += p;
+            b += q;
+            aa += p * p;
+            bb += q * q;
+            ab += p * q;
+        }
+    if (n < 24.0f) return 0;
+    const float mean_a = a / n, mean_b = b / n, var_a = aa / n - mean_a * mean_a, var_b = bb / n - mean_b * mean_b;
+    const float noise = 0.012f * 0.012f;
+    if (var_a < noise && var_b < noise) return fabsf(mean_a - mean_b) < 0.04f ? 60 : 0;
+    const float alike = (ab / n - mean_a * mean_b) / sqrtf((var_a + 0.25f * noise) * (var_b + 0.25f * noise));
+    return alike > 0.0f ? (int)(100.0f * (alike < 1.0f ? alike : 1.0f)) : 0;
+}
+
+static void gsf__carry_judge_row(void* arg, size_t row, int32_t worker) { // adds what the other reference says
+    (void)worker;
+    const gsf__carry_score_job* job = (const gsf__carry_score_job*)arg;
+    const int32_t width = job->carrier->references[job->reference].camera.width;
+    for (int32_t x = 0; x < width; x++) {
+        const size_t at = row * (size_t)width + (size_t)x;
+        job->refuted[at] = (uint8_t)(job->refuted[at] + (job->relation[at] == GSF__CARRY_THROUGH));
+        if (job->relation[at] != GSF__CARRY_AGREES) continue;
+        const int alike = gsf__carry_likeness(job, x, (int32_t)row);
+        job->support[at]++;
+        if (alike > job->alike[at]) job->alike[at] = (uint8_t)alike;
+    }
+}
+
+static void gsf__carry_score_row(void* arg, size_t row, int32_t worker) {
+    (void)worker;
+    const gsf__carry_score_job* job = (const gsf__carry_score_job*)arg;
+    const gsf__carry_reference* ref = job->carrier->references + job->reference;
+    for (int32_t x = 0; x < ref->camera.width; x++) {
+        const size_t at = row * (size_t)ref->camera.width + (size_t)x;
+        const int support = job->support[at], refuted = job->refuted[at], alike = job->alike[at];
+        int score = 0;
+        if (!(ref->depth[at] > 0.0f)) score = 0;
+        else if (job->stereo[at]) score = refuted > support ? 40 : 100;
+        else if (refuted > support) score = 5;
+        else if (support == 0) score = 30; // no other reference shows the place
+        else score = alike >= GSF__CARRY_ALIKE ? 70 : 40;
+        ref->score[at] = (uint8_t)score;
+    }
+}
+
+// Corrects the splats' depth where stereo is silent by the ratio of both around it: the log of the ratio is averaged in a
+// pyramid of sums, and every pixel takes it from the finest level that has evidence.
+static gsf_result gsf__carry_correct(gsf_context* ctx, gsf__carry_reference* ref, const float* confirmed) {
+    gsf__arena arena = {ctx, NULL, 0};
+    float *sum[GSF__CARRY_LEVELS], *weight[GSF__CARRY_LEVELS];
+    int32_t width[GSF__CARRY_LEVELS], height[GSF__CARRY_LEVELS];
+    const float prior = 0.05f; // pixels' worth of evidence that the next coarser level counts for
+    for (int l = 0; l < GSF__CARRY_LEVELS; l++) {
+        width[l] = l ? (width[l - 1] + 1) / 2 : ref->camera.width;
+        height[l] = l ? (height[l - 1] + 1) / 2 : ref->camera.height;
+        sum[l] = (float*)gsf__arena_alloc_zeroed(&arena, (size_t)width[l] * (size_t)height[l], sizeof(float));
+        weight[l] = (float*)gsf__arena_alloc_zeroed(&arena, (size_t)width[l] * (size_t)height[l], sizeof(float));
+    }
+    if (arena.failed) {
+        gsf__arena_free(&arena);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    const size_t pixels = (size_t)width[0] * (size_t)height[0];
+    for (size_t at = 0; at < pixels; at++) {
+        if (!(confirmed[at] > 0.0f && ref->depth[at] > 0.0f)) continue;
+        const float off = confirmed[at] / ref->depth[at] - 1.0f;
+        if (!(fabsf(off) < 0.2f)) continue; // a floater, or the background through a hole
+        sum[0][at] = off;
+        weight[0][at] = 1.0f;
+    }
+    for (int l = 1; l < GSF__CARRY_LEVELS; l++)
+        for (int32_t y = 0; y < height[l - 1]; y++)
+            for (int32_t x = 0; x < width[l - 1]; x++) {
+                const size_t from = (size_t)y * (size_t)width[l - 1] + (size_t)x;
+                const size_t to = (size_t)(y / 2) * (size_t)width[l] + (size_t)(x / 2);
+                sum[l][to] += sum[l - 1][from];
+                weight[l][to] += weight[l - 1][from];
+            }
+    for (int l = GSF__CARRY_LEVELS - 1; l >= 0; l--) // sum becomes the mean at the level
+        for (int32_t y = 0; y < height[l]; y++)
+            for (int32_t x = 0; x < width[l]; x++) {
+                const size_t at = (size_t)y * (size_t)width[l] + (size_t)x;
+                float coarse = 0.0f;
+                if (l + 1 < GSF__CARRY_LEVELS) {
+                    gsf_camera level;
+                    gsf__taps taps;
+                    memset(&level, 0, sizeof level);
+                    level.width = width[l + 1];
+                    level.height = height[l + 1];
+                    if (gsf__find_taps(&level, 0.5 * (x + 0.5), 0.5 * (y + 0.5), &taps))
+                        coarse = gsf__sample_floats(sum[l + 1], 1, 0, &taps);
+                }
+                sum[l][at] = (sum[l][at] + prior * coarse) / (weight[l][at] + prior);
+            }
+    for (size_t at = 0; at < pixels; at++) ref->depth[at] *= 1.0f + sum[0][at];
+    gsf__arena_free(&arena);
+    return GSF_OK;
+}
+
+// Replaces the depth of every reference by that of stereo where there is one, and scores all pixels.
+static gsf_result gsf__carrier_score(gsf_context* ctx, gsf__carrier* carrier) {
+    gsf__arena arena = {ctx, NULL, 0};
+    gsf__carry_score_job job;
+    size_t most = 0;
+    float** grey = (float**)gsf__arena_alloc_zeroed(&arena, (size_t)carrier->count, sizeof *grey);
+    for (int32_t i = 0; i < carrier->count && grey; i++) {
+        const gsf_camera* camera = &carrier->references[i].camera;
+        const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+        if (pixels > most) most = pixels;
+        grey[i] = (float*)gsf__arena_alloc(&arena, pixels, sizeof(float));
+    }
+    uint8_t** stereo = (uint8_t**)gsf__arena_alloc_zeroed(&arena, (size_t)carrier->count, sizeof *stereo);
+    for (int32_t i = 0; i < carrier->count && stereo; i++)
+        stereo[i] = (uint8_t*)gsf__arena_alloc_zeroed(&arena, (size_t)carrier->references[i].camera.width *
+                                                               (size_t)carrier->references[i].camera.height, 1);
+    memset(&job, 0, sizeof job);
+    job.carrier = carrier;
+    job.grey = (const float* const*)grey;
+    job.seen = (float*)gsf__arena_alloc(&arena, most, sizeof(float));
+    job.relation = (uint8_t*)gsf__arena_alloc(&arena, most, 1);
+    job.support = (uint8_t*)gsf__arena_alloc(&arena, most, 3);
+    if (arena.failed) {
+        gsf__arena_free(&arena);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_result result = GSF_OK;
+    float* confirmed = job.seen;
+    gsf__carry_set_exposure(carrier, NULL);
+    job.refuted = job.support + most;
+    job.alike = job.refuted + most;
+    for (int32_t i = 0; i < carrier->count && result == GSF_OK; i++) {
+        gsf__carry_reference* ref = carrier->references + i;
+        const int32_t width = ref->camera.width, height = ref->camera.height;
+        const gsf__carry_study* study = i < carrier->study_count ? carrier->studies + i : NULL;
+        for (int32_t y = 0; y < height; y++)
+            for (int32_t x = 0; x < width; x++)
+                confirmed[(size_t)y * (size_t)width + (size_t)x] =
+                    study ? gsf__carry_stereo_depth(study, &ref->camera, x, y) : 0.0f;
+        if (study && study->depth) result = gsf__carry_correct(ctx, ref, confirmed);
+        for (int32_t y = 0; y < height; y++)
+            for (int32_t x = 0; x < width; x++) {
+                const size_t at = (size_t)y * (size_t)width + (size_t)x;
+                float rgb[3];
+                gsf__carry_pixel(carrier, i, at, rgb);
+                grey[i][at] = 0.299f * rgb[0] + 0.587f * rgb[1] + 0.114f * rgb[2];
+                stereo[i][at] = confirmed[at] > 0.0f;
+                if (stereo[i][at]) ref->depth[at] = confirmed[at];
+            }
+    }
+    for (int32_t i = 0; i < carrier->count && result == GSF_OK; i++) {
+        const gsf__carry_reference* ref = carrier->references + i;
+        const size_t rows = (size_t)ref->camera.height;
+        int32_t others[GSF__CARRY_OTHERS + 1];
+        const int count = gsf__carry_nearest(carrier, ref->center, others, GSF__CARRY_OTHERS + 1);
         job.reference = i;
-        gsf__parallel_for(ctx, (size_t)warp->references[i].camera.height, gsf__warp_score_row, &job);
+        job.stereo = stereo[i];
+        memset(job.support, 0, 3 * most);
+        for (int k = 0; k < count; k++) {
+            job.other = others[k];
+            if (job.other == i) continue;
+            gsf__parallel_for(ctx, rows, gsf__carry_look_row, &job);
+            gsf__parallel_for(ctx, rows, gsf__carry_judge_row, &job);
+        }
+        gsf__parallel_for(ctx, rows, gsf__carry_score_row, &job);
     }
-    return GSF_OK;
+    gsf__arena_free(&arena);
+    return result;
 }
 
-typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_z 0: no surface
+// Copies the references. After an error the carrier is closed.
+static gsf_result gsf__carrier_take(gsf_context* ctx, gsf__carrier* carrier, const gsf_reference* references, int32_t count) {
+    carrier->references = (gsf__carry_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__carry_reference));
+    if (!carrier->references) return GSF_ERROR_OUT_OF_MEMORY;
+    carrier->count = count;
+    carrier->has_residuals = 1;
+    gsf_result result = GSF_OK;
+    for (int32_t i = 0; i < count; i++) carrier->has_residuals &= references[i].render.data != NULL;
+    for (int32_t i = 0; i < count && result == GSF_OK; i++)
+        result = gsf__carry_take(ctx, references + i, carrier->has_residuals, carrier->references + i);
+    if (result != GSF_OK) gsf__carrier_close(ctx, carrier);
+    return result;
+}
 
-// Rasterizes a triangle of inverse depths into the z-buffer (the largest inverse depth wins). Triangles that face away
-// or are stretched over more than 32 pixels are skipped: they are not a surface that the reference saw.
-static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c,
-                               float* inv_z, int32_t width, int32_t height) {
+// ---- one frame
+
+typedef struct gsf__carry_vertex { float u, v, inv_z; } gsf__carry_vertex; // inv_z 0: no surface
+typedef struct gsf__carry_span { float lo, hi; } gsf__carry_span;          // of the v of a row of vertices
+
+// Rasterizes a triangle of inverse depths into the rows begin..end-1 of the z-buffer (the largest inverse depth wins).
+// Triangles that face away or are stretched over more than 32 pixels are skipped: they are not a surface that the
+// reference saw.
+static void gsf__carry_triangle(const gsf__carry_vertex* a, const gsf__carry_vertex* b, const gsf__carry_vertex* c,
+                                float* inv_z, int32_t width, int32_t begin, int32_t end) {
     const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
     if (!(area > 1e-6f)) return;
     const float lo_u = fminf(a->u, fminf(b->u, c->u)), hi_u = fmaxf(a->u, fmaxf(b->u, c->u));
     const float lo_v = fminf(a->v, fminf(b->v, c->v)), hi_v = fmaxf(a->v, fmaxf(b->v, c->v));
-    if (!(hi_u > 0.0f && hi_v > 0.0f && lo_u < (float)width && lo_v < (float)height)) return;
+    if (!(hi_u > 0.0f && hi_v > (float)begin && lo_u < (float)width && lo_v < (float)end)) return;
     if (hi_u - lo_u > 32.0f || hi_v - lo_v > 32.0f) return;
-    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), y0 = lo_v < 0.5f ? 0 : (int32_t)(lo_v - 0.5f);
-    const int32_t x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1,
-                  y1 = hi_v < (float)height ? (int32_t)hi_v : height - 1;
+    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1;
+    const int32_t y0 = lo_v < (float)begin + 0.5f ? begin : (int32_t)(lo_v - 0.5f);
+    const int32_t y1 = hi_v < (float)end ? (int32_t)hi_v : end - 1;
     const float scale = 1.0f / area;
     for (int32_t y = y0; y <= y1; y++)
         for (int32_t x = x0; x <= x1; x++) {
@@ -11600,79 +12089,354 @@ static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex
         }
 }
 
-static int gsf__warp_connected(float a, float b, float c) {
+static int gsf__carry_connected(float a, float b, float c) {
     const float lo = fminf(a, fminf(b, c)), hi = fmaxf(a, fmaxf(b, c));
-    return lo > 0.0f && hi <= lo * GSF__WARP_EDGE;
+    return lo > 0.0f && hi <= lo * GSF__CARRY_EDGE;
 }
 
-// Rasterizes the reference's depth map as a mesh seen by `camera`. `rows` has room for two rows of vertices.
-static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* camera, gsf__warp_vertex* rows, float* inv_z) {
-    const int32_t width = ref->camera.width, height = ref->camera.height;
-    for (int32_t y = 0; y < height; y++) {
-        gsf__warp_vertex* now = rows + (size_t)(y & 1) * (size_t)width;
-        const gsf__warp_vertex* above = rows + (size_t)(~y & 1) * (size_t)width;
-        const float* depth = ref->depth + (size_t)y * (size_t)width;
-        for (int32_t x = 0; x < width; x++) {
-            double point[3], u, v, z;
-            now[x].inv_z = 0.0f;
-            if (!(depth[x] > 0.0f)) continue;
-            gsf__unproject(&ref->camera, x + 0.5, y + 0.5, (double)depth[x], point);
-            if (!gsf_project_point(camera, point, &u, &v, &z)) continue;
-            now[x].u = (float)u;
-            now[x].v = (float)v;
-            now[x].inv_z = (float)(1.0 / z);
-        }
-        if (y == 0) continue;
-        const float* depth_above = depth - width;
+typedef struct gsf__carry_draw_job {
+    const gsf__carry_reference* ref;
+    const gsf_camera* camera;    // of the frame
+    gsf__carry_vertex* vertices; // (H,W) of the reference
+    gsf__carry_span* spans;      // (H)
+    float* inv_z;                // (H,W) of the frame
+} gsf__carry_draw_job;
+
+static void gsf__carry_vertex_row(void* arg, size_t row, int32_t worker) {
+    (void)worker;
+    const gsf__carry_draw_job* job = (const gsf__carry_draw_job*)arg;
+    const gsf_camera* from = &job->ref->camera;
+    gsf__carry_vertex* vertices = job->vertices + row * (size_t)from->width;
+    const float* depth = job->ref->depth + row * (size_t)from->width;
+    const uint8_t* score = job->ref->score + row * (size_t)from->width;
+    gsf__carry_span span = {INFINITY, -INFINITY};
+    for (int32_t x = 0; x < from->width; x++) {
+        double point[3], u, v, z;
+        vertices[x].inv_z = 0.0f;
+        if (!(depth[x] > 0.0f) || score[x] == 0) continue;
+        gsf__unproject(from, x + 0.5, (double)row + 0.5, (double)depth[x], point);
+        if (!gsf_project_point(job->camera, point, &u, &v, &z)) continue;
+        vertices[x].u = (float)u;
+        vertices[x].v = (float)v;
+        vertices[x].inv_z = (float)(1.0 / z);
+        span.lo = fminf(span.lo, vertices[x].v);
+        span.hi = fmaxf(span.hi, vertices[x].v);
+    }
+    job->spans[row] = span;
+}
+
+static void gsf__carry_draw_band(void* arg, size_t band, int32_t worker) {
+    (void)worker;
+    const gsf__carry_draw_job* job = (const gsf__carry_draw_job*)arg;
+    const int32_t width = job->ref->camera.width, begin = (int32_t)band * GSF__CARRY_BAND;
+    const int32_t end = begin + GSF__CARRY_BAND < job->camera->height ? begin + GSF__CARRY_BAND : job->camera->height;
+    for (int32_t y = 1; y < job->ref->camera.height; y++) {
+        const gsf__carry_span *up = job->spans + y - 1, *down = job->spans + y;
+        if (!(fmaxf(up->hi, down->hi) > (float)begin && fminf(up->lo, down->lo) < (float)end)) continue;
+        const gsf__carry_vertex* above = job->vertices + (size_t)(y - 1) * (size_t)width;
+        const gsf__carry_vertex* now = above + width;
+        const float *depth_above = job->ref->depth + (size_t)(y - 1) * (size_t)width, *depth = depth_above + width;
         for (int32_t x = 0; x + 1 < width; x++) {
-            const gsf__warp_vertex *a = above + x, *b = above + x + 1, *c = now + x, *d = now + x + 1;
-            if (a->inv_z > 0.0f && b->inv_z > 0.0f && c->inv_z > 0.0f &&
-                gsf__warp_connected(depth_above[x], depth_above[x + 1], depth[x]))
-                gsf__warp_triangle(a, b, c, inv_z, camera->width, camera->height);
-            if (b->inv_z > 0.0f && d->inv_z > 0.0f && c->inv_z > 0.0f &&
-                gsf__warp_connected(depth_above[x + 1], depth[x + 1], depth[x]))
-                gsf__warp_triangle(b, d, c, inv_z, camera->width, camera->height);
+            const gsf__carry_vertex *a = above + x, *b = above + x + 1, *c = now + x, *d = now + x + 1;
+            if (!(b->inv_z > 0.0f && c->inv_z > 0.0f)) continue; // both triangles have them
+            if (a->inv_z > 0.0f && gsf__carry_connected(depth_above[x], depth_above[x + 1], depth[x]))
+                gsf__carry_triangle(a, b, c, job->inv_z, job->camera->width, begin, end);
+            if (d->inv_z > 0.0f && gsf__carry_connected(depth_above[x + 1], depth[x + 1], depth[x]))
+                gsf__carry_triangle(b, d, c, job->inv_z, job->camera->width, begin, end);
         }
     }
 }
 
-// Finds the references whose viewing direction to their focus is closest to that of a camera at `center`. Ties go to
-// the lower index. Returns their number.
-static int gsf__warp_nearest(const gsf__warp* warp, const double center[3], int32_t nearest[GSF__WARP_NEAREST]) {
-    double best[GSF__WARP_NEAREST];
-    int count = 0;
-    for (int32_t k = 0; k < warp->count; k++) {
-        const double cosine = gsf__ray_cosine(warp->references[k].focus, center, warp->references[k].center);
-        int at = count < GSF__WARP_NEAREST ? count++ : GSF__WARP_NEAREST;
-        for (; at > 0 && best[at - 1] < cosine; at--)
-            if (at < GSF__WARP_NEAREST) {
-                best[at] = best[at - 1];
-                nearest[at] = nearest[at - 1];
-            }
-        if (at < GSF__WARP_NEAREST) {
-            best[at] = cosine;
-            nearest[at] = k;
-        }
+// Draws `count` references into z-buffers of the frame, carrier->inv_z + slot * pixels.
+static gsf_result gsf__carrier_draw(gsf_context* ctx, gsf__carrier* carrier, const gsf_camera* camera, const int32_t* nearest,
+                                    int count) {
+    const size_t plane = (size_t)camera->width * (size_t)camera->height;
+    size_t room = 0;
+    for (int k = 0; k < count; k++) {
+        const gsf_camera* from = &carrier->references[nearest[k]].camera;
+        const size_t bytes = (size_t)from->width * (size_t)from->height * sizeof(gsf__carry_vertex) +
+                             (size_t)from->height * sizeof(gsf__carry_span);
+        if (bytes > room) room = bytes;
     }
-    return count;
+    GSF__TRY(gsf__reserve(ctx, &carrier->vertices, &carrier->vertex_capacity, 0, room, 1));
+    GSF__TRY(gsf__reserve(ctx, (void**)&carrier->inv_z, &carrier->inv_z_capacity, 0, plane * (size_t)count, sizeof(float)));
+    memset(carrier->inv_z, 0, plane * (size_t)count * sizeof(float));
+    double center[3];
+    gsf_get_camera_center(camera, center);
+    gsf__carry_set_exposure(carrier, center);
+    for (int k = 0; k < count; k++) {
+        gsf__carry_draw_job job;
+        job.ref = carrier->references + nearest[k];
+        job.camera = camera;
+        job.vertices = (gsf__carry_vertex*)carrier->vertices;
+        job.spans = (gsf__carry_span*)(void*)(job.vertices + (size_t)job.ref->camera.width * (size_t)job.ref->camera.height);
+        job.inv_z = carrier->inv_z + (size_t)k * plane;
+        gsf__parallel_for(ctx, (size_t)job.ref->camera.height, gsf__carry_vertex_row, &job);
+        gsf__parallel_for(ctx, (size_t)((camera->height + GSF__CARRY_BAND - 1) / GSF__CARRY_BAND), gsf__carry_draw_band, &job);
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__carry_sample { // what a reference shows at a pixel of a frame
+    gsf__taps taps; // in the reference
+    float depth;    // camera depth in the frame
+    float score;    // [0,1]
+    float angle2;   // squared angle between the rays to the frame and to the reference, radians
+} gsf__carry_sample;
+
+// Returns 0 where the reference shows nothing.
+static int gsf__carry_sample_at(const gsf__carry_reference* ref, const gsf_camera* camera, const double center[3], int32_t x,
+                                int32_t y, float inv_z, gsf__carry_sample* out) {
+    double point[3], u, v, z;
+    if (!(inv_z > 0.0f)) return 0;
+    gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inv_z, point);
+    if (!gsf_project_point(&ref->camera, point, &u, &v, &z)) return 0;
+    if (!gsf__find_taps(&ref->camera, u, v, &out->taps)) return 0;
+    out->score = gsf__sample_bytes(ref->score, 1, 0, 100.0, &out->taps);
+    if (!(out->score > 0.0f)) return 0;
+    const double cosine = gsf__ray_cosine(point, center, ref->center);
+    const float chord2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0));
+    out->angle2 = chord2 * (1.0f + chord2 * (1.0f / 12.0f + chord2 * (1.0f / 90.0f))); // (2 asin(chord / 2))^2
+    out->depth = (float)(1.0 / (double)inv_z);
+    return 1;
+}
+
+typedef struct gsf__carry_job {
+    const gsf__carrier* carrier;
+    const gsf_camera* camera;
+    double center[3];
+    int32_t reference;
+    const gsf_image* depth;                       // of the frame
+    const gsf_image* images[GSF__CARRIED_IMAGES]; // in the order of gsf_carried
+} gsf__carry_job;
+
+static void gsf__carry_row(void* arg, size_t row, int32_t worker) {
+    (void)worker;
+    const gsf__carry_job* job = (const gsf__carry_job*)arg;
+    const gsf_camera* camera = job->camera;
+    const gsf__carry_reference* ref = job->carrier->references + job->reference;
+    const int32_t y = (int32_t)row;
+    for (int32_t x = 0; x < camera->width; x++) {
+        gsf__carry_sample s;
+        double point[3], u, v, z;
+        float color[3] = {0.0f, 0.0f, 0.0f}, residual[3] = {0.0f, 0.0f, 0.0f}, back[3] = {0.0f, 0.0f, 0.0f}, ratio = 0.0f;
+        const int shows = gsf__carry_sample_at(ref, camera, job->center, x, y,
+                                               job->carrier->inv_z[row * (size_t)camera->width + (size_t)x], &s);
+        for (int c = 0; c < 3 && shows; c++) {
+            color[c] = gsf__carry_color(job->carrier, job->reference, (size_t)c, &s.taps);
+            if (job->carrier->has_residuals) residual[c] = gsf__sample_floats(ref->residual, 3, (size_t)c, &s.taps);
+        }
+        const float own = gsf__get_pixel(job->depth, x, y, 0);
+        gsf__taps taps;
+        if (own > 0.0f) {
+            gsf__unproject(camera, x + 0.5, y + 0.5, (double)own, point);
+            if (gsf_project_point(&ref->camera, point, &u, &v, &z) && gsf__find_taps(&ref->camera, u, v, &taps)) {
+                const float there = gsf__nearest_depth(ref, u, v);
+                ratio = there > 0.0f ? (float)z / there : 0.0f;
+                for (int c = 0; c < 3; c++) back[c] = gsf__carry_color(job->carrier, job->reference, (size_t)c, &taps);
+            }
+        }
+        for (int c = 0; c < 3; c++) {
+            gsf__put_pixel(job->images[0], x, y, c, color[c]);
+            gsf__put_pixel(job->images[1], x, y, c, residual[c]);
+            gsf__put_pixel(job->images[5], x, y, c, back[c]);
+        }
+        gsf__put_pixel(job->images[2], x, y, 0, shows ? s.score : 0.0f);
+        gsf__put_pixel(job->images[3], x, y, 0, shows ? s.depth : 0.0f);
+        gsf__put_pixel(job->images[4], x, y, 0, shows ? sqrtf(s.angle2) : 0.0f);
+        gsf__put_pixel(job->images[6], x, y, 0, ratio);
+    }
+}
+
+// Fills in *out, whose images exist at the frame's size. depth: of the frame.
+static gsf_result gsf__carrier_carry(gsf_context* ctx, gsf__carrier* carrier, const gsf_camera* camera, const gsf_image* depth,
+                                     int32_t slot, gsf_carried* out) {
+    gsf__carry_job job;
+    gsf_image* images[GSF__CARRIED_IMAGES];
+    int32_t channels[GSF__CARRIED_IMAGES], nearest[GSF__CARRY_SLOTS];
+    gsf__list_carried(out, images, channels);
+    memset(&job, 0, sizeof job);
+    job.carrier = carrier;
+    job.camera = camera;
+    job.depth = depth;
+    for (int k = 0; k < GSF__CARRIED_IMAGES; k++) job.images[k] = images[k];
+    gsf_get_camera_center(camera, job.center);
+    const int count = gsf__carry_nearest(carrier, job.center, nearest, slot + 1);
+    out->reference = slot < count ? nearest[slot] : -1;
+    if (slot >= count) {
+        for (int k = 0; k < GSF__CARRIED_IMAGES; k++)
+            memset(images[k]->data, 0, (size_t)camera->width * (size_t)camera->height * (size_t)channels[k] * sizeof(float));
+        return GSF_OK;
+    }
+    job.reference = nearest[slot];
+    GSF__TRY(gsf__carrier_draw(ctx, carrier, camera, nearest + slot, 1));
+    gsf__parallel_for(ctx, (size_t)camera->height, gsf__carry_row, &job);
+    return GSF_OK;
+}
+
+static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_camera* camera, int32_t channels) {
+    if (image->data && image->width == camera->width && image->height == camera->height) return GSF_OK;
+    gsf_destroy_image(ctx, image);
+    return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
+}
+
+// A carrier lent to a restorer for one window.
+typedef struct gsf__carry_loan {
+    gsf__carrier* carrier;
+    int32_t frame_count, slot_count;
+    const gsf_camera* cameras;  // of the frames
+    const gsf_image* depth;
+    gsf_image images[GSF__CARRIED_IMAGES]; // made on demand, in the order of gsf_carried
+} gsf__carry_loan;
+
+static void gsf__carry_end_loan(gsf_context* ctx, gsf__carry_loan* loan) {
+    for (int k = 0; k < GSF__CARRIED_IMAGES; k++) gsf_destroy_image(ctx, loan->images + k);
+    memset(loan, 0, sizeof *loan);
+}
+
+// carry_fn of the loop's windows.
+static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out) {
+    gsf__carry_loan* loan = (gsf__carry_loan*)user;
+    gsf_image* images[GSF__CARRIED_IMAGES];
+    int32_t channels[GSF__CARRIED_IMAGES];
+    if (frame < 0 || frame >= loan->frame_count || slot < 0 || slot >= loan->slot_count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "carry: frame %d of %d, reference %d of %d", (int)frame,
+                        (int)loan->frame_count, (int)slot, (int)loan->slot_count);
+    const gsf_camera* camera = loan->cameras + frame;
+    memset(out, 0, sizeof *out);
+    gsf__list_carried(out, images, channels);
+    for (int k = 0; k < GSF__CARRIED_IMAGES; k++) {
+        GSF__TRY(gsf__fit_image(ctx, loan->images + k, camera, channels[k]));
+        *images[k] = loan->images[k];
+        images[k]->owned = NULL;
+    }
+    return gsf__carrier_carry(ctx, loan->carrier, camera, loan->depth + frame, slot, out);
+}
+
+// ---- >>warp --------------------------------------------------------------------
+
+/* Training-free restorer: shows in a frame what the references (>>carry) explain of it. Per pixel, the candidates of the
+   nearest references are grouped by depth, and the nearest group with enough weight wins (occlusion).
+       verified    A candidate whose depth and colour another photo confirms is right information. If the frame shows
+                   another depth, its colour, at the exposure of the photos around, replaces the render; if the frame
+                   agrees, its residual is added in full, which keeps the render's shading (with six photos, colours
+                   there cost 0.2 dB). Candidates of the same group that are not verified are left out.
+       supported   Where only the splats vouch for the depth, a carried photo would displace all detail by the depth error
+                   and bring its shading along. The residual, photo - render at the photo's own camera, is what the splats
+                   do not yet explain; it is added to the render.
+       floaters    A residual would keep a floater: where two references look through the surface that the frame shows and
+                   none sees it there, the colours are taken even so.
+   Blending is weighted by score and angle; confidence falls where the candidates disagree. Pixels that no reference
+   reaches keep the render and get confidence 0, so that they are not trained on.
+   In the repair loop it shares the loop's carrier; elsewhere it makes one of its own from the references. If a reference has
+   no render, colours are taken everywhere. */
+
+typedef struct gsf__warp {
+    gsf__carrier own;  // the references, until the first window tells that the host carries
+    int begun, ready;  // ready: `own` is studied and scored
+} gsf__warp;
+
+#define GSF__WARP_ANGLE 0.2f            // radians: a reference whose viewing direction differs by this weighs exp(-1/2)
+#define GSF__WARP_GROUP_SHARE 0.35f     // share of the heaviest group's weight that a nearer group needs to occlude it
+#define GSF__WARP_TRUST 0.5f            // total weight below which a residual is attenuated
+#define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
+#define GSF__WARP_BEHIND_MAX 2.0f
+#define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
+enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
+
+static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
+                                  gsf_restorer_info* out) {
+    const gsf__warp* warp = (const gsf__warp*)user;
+    (void)ctx;
+    out->needs_depth = 1;
+    out->explains = 1;
+    if (out->struct_size >= sizeof *out) out->needs_carried = GSF__WARP_NEAREST;
+    const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
+    const int32_t drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
+    out->bytes = (double)width * height * (20.0 * count + 4.0 * drawn + 12.0);
+    out->flops = (double)width * height * frame_count * 200.0 * drawn;
+    return GSF_OK;
+}
+
+static void gsf__warp_end(void* user, gsf_context* ctx) {
+    gsf__warp* warp = (gsf__warp*)user;
+    gsf__carrier_forget(ctx, &warp->own);
+    warp->ready = warp->begun = 0;
+}
+
+static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    gsf__warp* warp = (gsf__warp*)user;
+    if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
+    if (warp->begun) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: in use by a run that has not ended");
+    for (int32_t i = 0; i < count; i++)
+        if (!references[i].color.data || !references[i].depth.data)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
+    GSF__TRY(gsf__carrier_take(ctx, &warp->own, references, count));
+    warp->begun = 1;
+    return GSF_OK;
+}
+
+// Every eighth pixel's point in each direction, of all references, to guide stereo.
+static double* gsf__warp_points(gsf_context* ctx, const gsf__carrier* carrier, size_t* count) {
+    size_t room = 1;
+    for (int32_t i = 0; i < carrier->count; i++) {
+        const gsf_camera* camera = &carrier->references[i].camera;
+        room += (size_t)(camera->width / 8 + 1) * (size_t)(camera->height / 8 + 1);
+    }
+    double* points = (double*)gsf_alloc(ctx, room, 3 * sizeof *points);
+    *count = 0;
+    for (int32_t i = 0; i < carrier->count && points; i++) {
+        const gsf__carry_reference* ref = carrier->references + i;
+        for (int32_t y = 4; y < ref->camera.height; y += 8)
+            for (int32_t x = 4; x < ref->camera.width; x += 8) {
+                const float depth = ref->depth[(size_t)y * (size_t)ref->camera.width + (size_t)x];
+                if (depth > 0.0f)
+                    gsf__unproject(&ref->camera, x + 0.5, y + 0.5, (double)depth, points + 3 * (*count)++);
+            }
+    }
+    return points;
+}
+
+// Makes `own` ready to be drawn.
+static gsf_result gsf__warp_study(gsf_context* ctx, gsf__warp* warp) {
+    gsf__carrier* carrier = &warp->own;
+    size_t point_count;
+    if (warp->ready) return GSF_OK;
+    double* points = gsf__warp_points(ctx, carrier, &point_count);
+    gsf_scene_view* views = (gsf_scene_view*)gsf_alloc_zeroed(ctx, (size_t)carrier->count, sizeof *views);
+    gsf_result result = points && views ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < carrier->count && views; i++) {
+        gsf__carry_reference* ref = carrier->references + i;
+        void* pixels = ref->bytes ? (void*)ref->bytes : (void*)ref->color;
+        views[i].camera = ref->camera;
+        views[i].image = gsf_wrap_image(pixels, ref->bytes ? GSF_U8 : GSF_F32, ref->camera.width, ref->camera.height, 3);
+    }
+    if (result == GSF_OK && !carrier->studies)
+        result = gsf__carrier_study(ctx, carrier, views, carrier->count, points, point_count, 0);
+    if (result == GSF_OK) result = gsf__carrier_score(ctx, carrier);
+    if (result == GSF_OK) warp->ready = 1;
+    gsf_free(ctx, points);
+    gsf_free(ctx, views);
+    return result;
 }
 
 typedef struct gsf__warp_job {
-    const gsf__warp* warp;
+    const gsf__carrier* carrier;
     const gsf_restore_window* window;
-    float* scratch;        // per worker: (GSF__WARP_NEAREST, pixels) inverse depths, then two rows of vertices
-    size_t scratch_floats, row_floats;
+    int32_t frame, known;  // known: the reference whose own view the frame is, or -1
+    double center[3];
+    int32_t nearest[GSF__WARP_NEAREST];
+    int near_count;
 } gsf__warp_job;
 
 // Returns 1 if the surface that the frame shows at camera depth `z` is a floater: at least two references look through
 // it, and none shows a surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges).
-static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
-                             int32_t x, int32_t y, double z) {
+static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z) {
     int through = 0;
     double point[3], u, v, depth;
     gsf__unproject(camera, x + 0.5, y + 0.5, z, point);
-    for (int k = 0; k < near_count; k++) {
-        const gsf__warp_reference* ref = warp->references + nearest[k];
+    for (int k = 0; k < job->near_count; k++) {
+        const gsf__carry_reference* ref = job->carrier->references + job->nearest[k];
         if (!gsf_project_point(&ref->camera, point, &u, &v, &depth)) continue;
         int behind = 0;
         for (int i = 0; i < 9; i++) {
@@ -11680,7 +12444,7 @@ static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int 
             const float seen = gsf__nearest_depth(ref, at_u, at_v);
             if (!(seen > 0.0f)) continue;
             const float off = (float)depth / seen - 1.0f;
-            if (fabsf(off) <= GSF__WARP_DEPTH_TOLERANCE) return 0;
+            if (fabsf(off) <= GSF__CARRY_DEPTH_TOLERANCE) return 0;
             behind += off < 0.0f;
         }
         through += behind == 9;
@@ -11689,62 +12453,62 @@ static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int 
 }
 
 typedef struct gsf__warp_candidate {
-    const gsf__warp_reference* ref;
-    gsf__taps taps; // in the reference
-    float depth;    // camera depth in the frame
+    gsf__carry_sample sample;
+    int32_t reference;
     float weight;
 } gsf__warp_candidate;
 
-// Restores one pixel, whose render is rgb at depth `shown`, from the references. Returns the confidence; if no
-// reference reaches the pixel, returns 0 and leaves rgb unchanged.
-static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
-                             const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float shown,
-                             float rgb[3]) {
-    gsf__warp_candidate candidates[GSF__WARP_NEAREST];
-    int count = 0;
-    for (int k = 0; k < near_count; k++) {
-        const float inverse = inv_z[(size_t)k * plane];
-        if (!(inverse > 0.0f)) continue;
-        gsf__warp_candidate* at = candidates + count;
-        at->ref = warp->references + nearest[k];
-        double point[3], u, v, z;
-        gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
-        if (!gsf_project_point(&at->ref->camera, point, &u, &v, &z)) continue;
-        if (!gsf__find_taps(&at->ref->camera, u, v, &at->taps)) continue;
-        const double cosine = gsf__ray_cosine(point, center, at->ref->center);
-        const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // the squared angle, to second order
-        const float score = gsf__sample_bytes(at->ref->score, 1, 0, 100.0, &at->taps);
-        if (!(score > 0.0f)) continue;
-        at->depth = (float)(1.0 / (double)inverse);
-        at->weight = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
-        count++;
-    }
-    if (count == 0) return 0.0f;
-
-    float heaviest = 0.0f, group[GSF__WARP_NEAREST];
+// The depth of the nearest group of candidates that is heavy enough to hide those behind it.
+static float gsf__warp_front(const gsf__warp_candidate* candidates, int count) {
+    float heaviest = 0.0f, front = 0.0f, group[GSF__WARP_NEAREST];
     for (int i = 0; i < count; i++) {
+        const float depth = candidates[i].sample.depth;
         group[i] = 0.0f;
         for (int j = 0; j < count; j++)
-            if (fabsf(candidates[j].depth - candidates[i].depth) <= GSF__WARP_DEPTH_TOLERANCE * candidates[i].depth)
+            if (fabsf(candidates[j].sample.depth - depth) <= GSF__CARRY_DEPTH_TOLERANCE * depth)
                 group[i] += candidates[j].weight;
         if (group[i] > heaviest) heaviest = group[i];
     }
-    float front = 0.0f;
     for (int i = 0; i < count; i++)
-        if (group[i] >= GSF__WARP_GROUP_SHARE * heaviest && (front == 0.0f || candidates[i].depth < front))
-            front = candidates[i].depth;
+        if (group[i] >= GSF__WARP_GROUP_SHARE * heaviest && (front == 0.0f || candidates[i].sample.depth < front))
+            front = candidates[i].sample.depth;
+    return front;
+}
 
-    const int refuted = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX &&
-                        gsf__warp_refutes(warp, nearest, near_count, camera, x, y, (double)shown);
-    const int colors = refuted || !warp->has_residuals;
+// Restores one pixel, whose render is rgb at depth `shown`, from the references. Returns the confidence; if no
+// reference reaches the pixel, returns 0 and leaves rgb unchanged.
+static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, const float* inv_z,
+                             size_t plane, float shown, float rgb[3]) {
+    gsf__warp_candidate candidates[GSF__WARP_NEAREST];
+    int count = 0, verified = 0;
+    for (int k = 0; k < job->near_count; k++) {
+        gsf__warp_candidate* at = candidates + count;
+        at->reference = job->nearest[k];
+        if (!gsf__carry_sample_at(job->carrier->references + at->reference, camera, job->center, x, y,
+                                  inv_z[(size_t)k * plane], &at->sample))
+            continue;
+        at->weight = at->sample.score * gsf__exp(-0.5f * at->sample.angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
+        count++;
+    }
+    if (count == 0) return 0.0f;
+    const float front = gsf__warp_front(candidates, count);
+    for (int i = 0; i < count; i++)
+        verified |= fabsf(candidates[i].sample.depth - front) <= GSF__CARRY_DEPTH_TOLERANCE * front &&
+                    candidates[i].sample.score >= 0.01f * (float)GSF__CARRY_VERIFIED;
+    const int behind = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
+    const int refuted = !verified && behind && gsf__warp_refutes(job, camera, x, y, (double)shown);
+    const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
+    const int colors = refuted || (verified && !agrees) || !job->carrier->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
         const gsf__warp_candidate* at = candidates + i;
-        if (!(fabsf(at->depth - front) <= GSF__WARP_DEPTH_TOLERANCE * front)) continue;
+        if (!(fabsf(at->sample.depth - front) <= GSF__CARRY_DEPTH_TOLERANCE * front)) continue;
+        if (verified && at->sample.score < 0.01f * (float)GSF__CARRY_VERIFIED) continue;
         total += at->weight;
         for (size_t c = 0; c < 3; c++) {
-            const float value = colors ? gsf__sample_color(at->ref, c, &at->taps)
-                                       : gsf__sample_floats(at->ref->residual, 3, c, &at->taps);
+            const float value = colors ? gsf__carry_color(job->carrier, at->reference, c, &at->sample.taps)
+                                       : gsf__sample_floats(job->carrier->references[at->reference].residual, 3, c,
+                                                            &at->sample.taps);
             sum[c] += at->weight * value;
             square += at->weight * value * value;
         }
@@ -11753,73 +12517,64 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
     for (int c = 0; c < 3; c++) spread -= sum[c] / total * (sum[c] / total);
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
-        rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
-    return (refuted || total > 1.0f ? 1.0f : total) * agreement;
+        rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
+    return (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
-static void gsf__warp_frame(void* arg, size_t frame, int32_t worker) {
+static void gsf__warp_row(void* arg, size_t row, int32_t worker) {
+    (void)worker;
     const gsf__warp_job* job = (const gsf__warp_job*)arg;
-    const gsf__warp* warp = job->warp;
     const gsf_restore_window* window = job->window;
-    const gsf_camera* camera = window->cameras + frame;
-    const gsf_image *color = window->out_color + frame, *confidence = window->out_confidence + frame;
-    const int32_t known = window->reference_index ? window->reference_index[frame] : -1;
+    const gsf_camera* camera = window->cameras + job->frame;
     const size_t plane = (size_t)camera->width * (size_t)camera->height;
-    float* inv_z = job->scratch + (size_t)worker * job->scratch_floats;
-    gsf__warp_vertex* rows = (gsf__warp_vertex*)(void*)(inv_z + job->scratch_floats - job->row_floats);
-    double center[3];
-    int32_t nearest[GSF__WARP_NEAREST];
-    gsf_get_camera_center(camera, center);
-    const int near_count = gsf__warp_nearest(warp, center, nearest);
-    memset(inv_z, 0, (job->scratch_floats - job->row_floats) * sizeof(float));
-    for (int k = 0; k < near_count && known < 0; k++)
-        gsf__warp_draw(warp->references + nearest[k], camera, rows, inv_z + (size_t)k * plane);
-    for (int32_t y = 0; y < camera->height; y++)
-        for (int32_t x = 0; x < camera->width; x++) {
-            float rgb[3], weight;
-            const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
-            for (int c = 0; c < 3; c++) rgb[c] = gsf__get_pixel(window->color + frame, x, y, c);
-            if (known >= 0) { // the frame is a reference's own view: use its photo
-                const gsf__warp_reference* ref = warp->references + known;
-                const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
-                const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
-                weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
-                gsf__taps taps;
-                const int inside = gsf__find_taps(&ref->camera, u, v, &taps);
-                for (size_t c = 0; c < 3 && weight > 0.0f; c++) rgb[c] = inside ? gsf__sample_color(ref, c, &taps) : 0.0f;
-            } else {
-                const float shown = window->depth ? gsf__get_pixel(window->depth + frame, x, y, 0) : 0.0f;
-                weight = gsf__warp_pixel(warp, nearest, near_count, camera, center, x, y, inv_z + at, plane, shown, rgb);
-            }
-            for (int c = 0; c < 3; c++) gsf__put_pixel(color, x, y, c, rgb[c]);
-            gsf__put_pixel(confidence, x, y, 0, weight);
+    const int32_t y = (int32_t)row;
+    for (int32_t x = 0; x < camera->width; x++) {
+        float rgb[3], weight;
+        for (int c = 0; c < 3; c++) rgb[c] = gsf__get_pixel(window->color + job->frame, x, y, c);
+        if (job->known >= 0) { // use its photo
+            const gsf__carry_reference* ref = job->carrier->references + job->known;
+            const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
+            const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
+            weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
+            gsf__taps taps;
+            const int inside = gsf__find_taps(&ref->camera, u, v, &taps);
+            for (size_t c = 0; c < 3 && weight > 0.0f; c++) rgb[c] = inside ? gsf__photo_color(ref, c, &taps) : 0.0f;
+        } else {
+            const float shown = window->depth ? gsf__get_pixel(window->depth + job->frame, x, y, 0) : 0.0f;
+            weight = gsf__warp_pixel(job, camera, x, y, job->carrier->inv_z + row * (size_t)camera->width + (size_t)x, plane,
+                                     shown, rgb);
         }
+        for (int c = 0; c < 3; c++) gsf__put_pixel(window->out_color + job->frame, x, y, c, rgb[c]);
+        gsf__put_pixel(window->out_confidence + job->frame, x, y, 0, weight);
+    }
 }
 
 static gsf_result gsf__warp_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
-    const gsf__warp* warp = (const gsf__warp*)user;
+    gsf__warp* warp = (gsf__warp*)user;
+    gsf__carrier* carrier = &warp->own;
     if (window->frame_count < 1) return GSF_OK;
-    size_t pixels = 0, widest = 0;
+    if (gsf__carry_fn_of(window) == gsf__carry_for_window) { // the loop's: no copies of the references are needed
+        carrier = ((gsf__carry_loan*)window->carry_user)->carrier;
+        gsf__carrier_close(ctx, &warp->own);
+    } else {
+        GSF__TRY(gsf__warp_study(ctx, warp));
+    }
     for (int32_t f = 0; f < window->frame_count; f++) {
         const gsf_camera* camera = window->cameras + f;
         GSF__TRY(gsf_check_camera(ctx, camera));
         GSF__TRY(gsf__check_output(ctx, window->color + f, "color", 3, camera));
         GSF__TRY(gsf__check_output(ctx, window->out_color + f, "out_color", 3, camera));
         GSF__TRY(gsf__check_output(ctx, window->out_confidence + f, "out_confidence", 1, camera));
-        const size_t n = (size_t)camera->width * (size_t)camera->height;
-        if (n > pixels) pixels = n;
+        gsf__warp_job job;
+        job.carrier = carrier;
+        job.window = window;
+        job.frame = f;
+        job.known = window->reference_index ? window->reference_index[f] : -1;
+        gsf_get_camera_center(camera, job.center);
+        job.near_count = gsf__carry_nearest(carrier, job.center, job.nearest, GSF__WARP_NEAREST);
+        if (job.known < 0) GSF__TRY(gsf__carrier_draw(ctx, carrier, camera, job.nearest, job.near_count));
+        gsf__parallel_for(ctx, (size_t)camera->height, gsf__warp_row, &job);
     }
-    for (int32_t k = 0; k < warp->count; k++)
-        if ((size_t)warp->references[k].camera.width > widest) widest = (size_t)warp->references[k].camera.width;
-    gsf__warp_job job;
-    job.warp = warp;
-    job.window = window;
-    job.row_floats = 2 * widest * (sizeof(gsf__warp_vertex) / sizeof(float));
-    job.scratch_floats = pixels * GSF__WARP_NEAREST + job.row_floats;
-    job.scratch = (float*)gsf_alloc(ctx, job.scratch_floats, (size_t)ctx->parallel.worker_count * sizeof(float));
-    if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__parallel_for(ctx, (size_t)window->frame_count, gsf__warp_frame, &job);
-    gsf_free(ctx, job.scratch);
     return GSF_OK;
 }
 
@@ -11848,7 +12603,7 @@ typedef struct gsf__seen_job {
     const gsf_camera *camera, *seeing;
     size_t seeing_count;
     const float *depth, *alpha;        // rendered from `camera`
-    const gsf__warp_reference* others; // cameras and depth maps of `seeing`
+    const gsf__carry_reference* others; // cameras and depth maps of `seeing`
     const gsf_image* mask;
 } gsf__seen_job;
 
@@ -11892,7 +12647,7 @@ GSF_API gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats
     gsf__arena arena = {ctx, NULL, 0};
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
     float* planes = (float*)gsf__arena_alloc(&arena, pixels, 2 * sizeof(float));
-    gsf__warp_reference* others = (gsf__warp_reference*)gsf__arena_alloc_zeroed(&arena, seeing_count, sizeof *others);
+    gsf__carry_reference* others = (gsf__carry_reference*)gsf__arena_alloc_zeroed(&arena, seeing_count, sizeof *others);
     gsf_result result = arena.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_splat_make_rasterizer(ctx, &rasterizer);
     if (result == GSF_OK) result = gsf__render_depth(ctx, rasterizer, splats, camera, planes, planes + pixels);
     for (size_t k = 0; k < seeing_count && result == GSF_OK; k++) {
@@ -11942,6 +12697,11 @@ struct gsf_fixer {
     gsf_image *rendered, *depth, *alpha, *restored, *confidence; // frames of one window
     gsf__kept_frames pending;       // frames of this round so far; those in training are trainer->restored
     gsf_restorer_info limits;
+    // What carries photos into frames, for restorers that ask for it. The rest is empty unless one does.
+    gsf__carrier carrier;
+    gsf__carry_loan loan;           // of the current window
+    double* points;                 // (point_count,3) means of the initial splats, which guide stereo
+    size_t point_count;
 };
 
 static void gsf__drop_frames(gsf_context* ctx, gsf__kept_frames* list) {
@@ -11968,6 +12728,8 @@ static void gsf__drop_path(gsf_context* ctx, gsf_fixer* f) {
 
 static void gsf__close_references(gsf_context* ctx, gsf_fixer* f) {
     if (!f->references_open) return;
+    gsf__carry_end_loan(ctx, &f->loan);
+    gsf__carrier_close(ctx, &f->carrier);
     f->restorer->end_fn(f->restorer->user, ctx);
     if (f->explain.user) f->explain.end_fn(f->explain.user, ctx);
     f->references_open = 0;
@@ -11976,6 +12738,8 @@ static void gsf__close_references(gsf_context* ctx, gsf_fixer* f) {
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     if (!f) return;
     gsf__close_references(ctx, f);
+    gsf__carrier_forget(ctx, &f->carrier);
+    gsf_free(ctx, f->points);
     gsf_splat_destroy_warp(ctx, &f->explain);
     gsf__drop_window(ctx, f);
     gsf__drop_frames(ctx, &f->pending);
@@ -12133,6 +12897,16 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) { // of round
     return result;
 }
 
+static int gsf__carries(const gsf_fixer* f) { return f->limits.needs_carried > 0 || f->explain.user != NULL; }
+
+static gsf_result gsf__keep_points(gsf_context* ctx, gsf_fixer* f, const gsf_splats* initial) {
+    f->points = (double*)gsf_alloc(ctx, initial->count + 1, 3 * sizeof *f->points);
+    if (!f->points) return GSF_ERROR_OUT_OF_MEMORY;
+    f->point_count = initial->count;
+    for (size_t i = 0; i < 3 * initial->count; i++) f->points[i] = initial->origin[i % 3] + (double)initial->means[i];
+    return GSF_OK;
+}
+
 // Samples the path of every round once, so that an impossible path is reported before training starts.
 static gsf_result gsf__check_paths(gsf_context* ctx, gsf_fixer* f) {
     gsf_result result = GSF_OK;
@@ -12166,6 +12940,7 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
         result = gsf_splat_make_warp(ctx, &f->explain);
+    if (result == GSF_OK && gsf__carries(f)) result = gsf__keep_points(ctx, f, initial);
 cleanup:
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
     else *out = f;
@@ -12251,15 +13026,42 @@ static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, 
     return result;
 }
 
-// Makes the references of all views and begins the restorer (and the internal warp) with them.
+// Lets the carrier study the photos, unless it already has.
+static gsf_result gsf__study_photos(gsf_context* ctx, gsf_fixer* f) {
+    gsf__arena arena = {ctx, NULL, 0};
+    if (f->carrier.studies) return GSF_OK;
+    gsf_scene_view* views = (gsf_scene_view*)gsf__arena_alloc_zeroed(&arena, f->view_count, sizeof *views);
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < f->view_count && views && result == GSF_OK; i++) {
+        const gsf__photo* photo = &f->trainer->photos.photos[i];
+        const int32_t width = f->cameras[i].width, height = f->cameras[i].height;
+        views[i].camera = f->cameras[i];
+        views[i].image = gsf_wrap_image(photo->pixels, photo->target.u8 ? GSF_U8 : GSF_F32, width, height, 3);
+        if (!photo->target.weight) continue;
+        const gsf_image weight = gsf_wrap_image(photo->weight, GSF_F32, width, height, 1);
+        uint8_t* bytes = (uint8_t*)gsf__arena_alloc(&arena, (size_t)width * (size_t)height, 1);
+        views[i].weight = gsf_wrap_image(bytes, GSF_U8, width, height, 1);
+        if (bytes) result = gsf_convert_image(ctx, &weight, &views[i].weight);
+    }
+    if (result == GSF_OK && arena.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK)
+        result = gsf__carrier_study(ctx, &f->carrier, views, (int32_t)f->view_count, f->points, f->point_count,
+                                    f->desc.train.seed);
+    gsf__arena_free(&arena);
+    return result;
+}
+
+// Makes the references of all views, and begins the carrier and the restorer (and the internal warp) with them.
 static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     if (f->references_open) return GSF_OK;
     gsf_reference* references = (gsf_reference*)gsf_alloc_zeroed(ctx, f->view_count, sizeof(gsf_reference));
     if (!references) return GSF_ERROR_OUT_OF_MEMORY;
-    const int needs_depth = f->limits.needs_depth || f->explain.user;
-    gsf_result result = GSF_OK;
+    const int carries = gsf__carries(f), needs_depth = f->limits.needs_depth || carries;
+    gsf_result result = carries ? gsf__study_photos(ctx, f) : GSF_OK;
     for (size_t i = 0; i < f->view_count && result == GSF_OK; i++)
         result = gsf__make_reference(ctx, f, i, needs_depth, references + i);
+    if (result == GSF_OK && carries) result = gsf__carrier_take(ctx, &f->carrier, references, (int32_t)f->view_count);
+    if (result == GSF_OK && carries) result = gsf__carrier_score(ctx, &f->carrier);
     if (result == GSF_OK)
         result = f->restorer->begin_fn(f->restorer->user, ctx, references, (int32_t)f->view_count);
     if (result == GSF_OK && f->explain.user) {
@@ -12267,6 +13069,7 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
         if (result != GSF_OK) f->restorer->end_fn(f->restorer->user, ctx);
     }
     if (result == GSF_OK) f->references_open = 1;
+    else gsf__carrier_close(ctx, &f->carrier);
     for (size_t i = 0; i < f->view_count; i++) {
         gsf_destroy_image(ctx, &references[i].color);
         gsf_destroy_image(ctx, &references[i].render);
@@ -12274,12 +13077,6 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     }
     gsf_free(ctx, references);
     return result;
-}
-
-static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_camera* camera, int32_t channels) {
-    if (image->data && image->width == camera->width && image->height == camera->height) return GSF_OK;
-    gsf_destroy_image(ctx, image);
-    return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
 }
 
 // PSNR in dB of the window's render against what the references explain (out_color), over the explained pixels,
@@ -12308,7 +13105,9 @@ static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, con
     *skip = 0;
     if (f->desc.skip_psnr > 0.0f) {
         const gsf_restorer* explain = f->limits.explains ? f->restorer : &f->explain;
-        GSF__TRY(explain->restore_fn(explain->user, ctx, window));
+        gsf_restore_window shared = *window; // the internal warp uses the loop's carrier, whatever the restorer asks for
+        if (gsf__carries(f)) shared.carry_fn = gsf__carry_for_window;
+        GSF__TRY(explain->restore_fn(explain->user, ctx, &shared));
         *skip = gsf__window_agreement(window) >= (double)f->desc.skip_psnr;
         if (*skip || f->limits.explains) return GSF_OK;
     }
@@ -12422,6 +13221,13 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     window.alpha = f->limits.needs_alpha ? f->alpha : NULL;
     window.out_color = f->restored;
     window.out_confidence = f->confidence;
+    f->loan.carrier = &f->carrier;
+    f->loan.frame_count = f->frames;
+    f->loan.slot_count = f->limits.needs_carried < GSF__CARRY_SLOTS ? f->limits.needs_carried : GSF__CARRY_SLOTS;
+    f->loan.cameras = window.cameras;
+    f->loan.depth = f->depth;
+    window.carry_fn = f->limits.needs_carried > 0 ? gsf__carry_for_window : NULL;
+    window.carry_user = &f->loan;
     GSF__TRY(gsf__restore_or_skip(ctx, f, &window, &skip));
     if (!skip) GSF__TRY(gsf__keep_window(ctx, f, &window));
     f->skipped += skip;

@@ -28,6 +28,36 @@ static gsf_result fake_begin(void* user, gsf_context* ctx, const gsf_reference* 
     return GSF_OK;
 }
 
+// Carries its arguments: the score is 1/8 in the left half and 0 in the right one, the depth tells the frame of the clip.
+typedef struct fake_carrier { gsf_image images[7]; int32_t calls; } fake_carrier;
+static gsf_result fake_carry(void* user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out) {
+    fake_carrier* c = (fake_carrier*)user;
+    (void)ctx;
+    gsf_image* const to[7] = {&out->color, &out->residual, &out->score, &out->depth, &out->angle, &out->back_color,
+                              &out->back_ratio};
+    for (int k = 0; k < 7; k++) *to[k] = c->images[k];
+    for (int64_t i = 0; i < out->score.width * out->score.height; i++) {
+        ((float*)out->score.data)[i] = i % out->score.width < out->score.width / 2 ? 0.125f : 0.0f;
+        ((float*)out->depth.data)[i] = (float)(frame + 1);
+        for (int k = 0; k < 3; k++) ((float*)out->color.data)[3 * i + k] = (float)k;
+    }
+    out->reference = slot;
+    c->calls++;
+    return GSF_OK;
+}
+
+// Every frame of a part is carried at the part's size.
+static void check_carried(gsf_context* ctx, const fake* f, const gsf_restore_window* w) {
+    gsf_carried k;
+    for (int32_t i = 0; i < w->frame_count; i++) {
+        if (!CHECK_OK(ctx, w->carry_fn(w->carry_user, ctx, i, 2, &k))) return;
+        const float *score = (const float*)k.score.data, *depth = (const float*)k.depth.data;
+        CHECK(k.reference == 2 && k.score.width == f->width && k.back_color.height == f->height);
+        CHECK(score[0] == 0.125f && score[f->width - 1] == 0.0f && ((const float*)k.color.data)[5] == 2.0f);
+        CHECK_NEAR(((const float*)w->color[i].data)[0], (depth[0] - 1.0f + 40.0f) / 255.0f, 1e-6); // this frame of the clip
+    }
+}
+
 static gsf_result fake_restore(void* user, gsf_context* ctx, const gsf_restore_window* w) {
     fake* f = (fake*)user;
     CHECK(w->part == f->calls && w->clip == 5 && w->seed == 70u + (uint64_t)f->calls);
@@ -38,6 +68,8 @@ static gsf_result fake_restore(void* user, gsf_context* ctx, const gsf_restore_w
     f->first[f->calls] = ((const float*)w->color[0].data)[0];
     f->last[f->calls] = ((const float*)w->color[w->frame_count - 1].data)[0];
     if (w->depth) f->depth = ((const float*)w->depth[0].data)[0];
+    CHECK(w->struct_size == sizeof *w);
+    if (w->carry_fn) check_carried(ctx, f, w);
     for (int32_t i = 0; i < w->frame_count; i++) {
         CHECK(w->color[i].width == f->width && w->out_color[i].height == f->height);
         CHECK(!w->cameras || (w->cameras[i].width == f->width && w->cameras[i].height == f->height));
@@ -184,6 +216,31 @@ static void test_sizes(gsf_context* ctx) {
     }
 }
 
+// carry_fn is passed on: as it is, in another size, in parts. A host whose window ends before it has none.
+static void test_carried(gsf_context* ctx) {
+    static const int32_t channels[7] = {3, 3, 1, 1, 1, 3, 1};
+    for (int way = 0; way < 4; way++) {
+        static clip c;
+        fake_carrier carrier = {0};
+        fake f = make_fake();
+        if (way >= 1) f.limits.width_multiple = f.limits.height_multiple = 16;
+        if (way >= 2) f.limits.frame_count_max = f.limits.frame_count = 7;
+        f.restorer.user = &f;
+        make_clip(ctx, &c, 12, 30, 20);
+        for (int k = 0; k < 7; k++) CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, 30, 20, channels[k], &carrier.images[k]));
+        c.window.carry_fn = fake_carry;
+        c.window.carry_user = &carrier;
+        if (way == 3) c.window.struct_size = (uint32_t)offsetof(gsf_restore_window, carry_fn);
+        CHECK_OK(ctx, gsf_restore_clip(ctx, &f.restorer, &c.window));
+        CHECK(f.calls == (way < 2 ? 1 : 2) && carrier.calls == (way < 2 ? 12 : way == 2 ? 14 : 0));
+        for (int k = 0; k < 7; k++) gsf_destroy_image(ctx, &carrier.images[k]);
+        free_clip(ctx, &c);
+    }
+    gsf_restore_window window = {0};
+    window.struct_size = (uint32_t)offsetof(gsf_restore_window, carry_fn) - 1;
+    CHECK_RESULT(ctx, gsf_restore_clip(ctx, NULL, &window), GSF_ERROR_INVALID_ARGUMENT);
+}
+
 static void test_trouble(void) { // a failing part, and allocation failure at every call
     static clip c;
     counter count;
@@ -218,6 +275,7 @@ int main(void) {
     test_context_init(&ctx);
     test_lengths(&ctx);
     test_sizes(&ctx);
+    test_carried(&ctx);
     test_trouble();
     return test_report();
 }

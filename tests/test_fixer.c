@@ -92,7 +92,7 @@ static void test_warp(gsf_context* ctx) {
         for (int c = 0; c < 3; c++) worst = fmax(worst, fabs((double)(out_color[3 * i + c] - color[2][3 * i + c])));
     }
     CHECK(covered > N * 9 / 10);
-    CHECK_NEAR(worst, 0.0, 0.02); // bilinear sampling of the texture
+    CHECK_NEAR(worst, 0.0, 0.03); // bilinear sampling of the texture, at the depth that stereo finds
     // a reference with a much smaller depth contradicts the other and is rejected
     for (int i = 0; i < N; i++)
         if (i % W > 20 && i % W < 50) depth[0][i] = 1.5f;
@@ -123,8 +123,9 @@ static void test_warp(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
-// References with renders: the residual of the photos is added to the frame, a difference in exposure between photos
-// and frame is not. The splats here show the plane without its green, and the frame's exposure is 0.1 brighter.
+// References with renders. The splats here show the plane without its green, and the frame's exposure is 0.1 brighter.
+// Where the photos verify the plane, the frame gets their colours. Where only the splats vouch for it, as for a single
+// photo, the residual of the photo is added to the frame, and its exposure is kept.
 static void test_warp_residual(gsf_context* ctx) {
     enum { W = 96, H = 64, N = W * H };
     static float color[4][3 * N], render[4][3 * N], depth[4][N], out_color[3 * N], out_confidence[N];
@@ -152,15 +153,27 @@ static void test_warp_residual(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 3));
     CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
-    int whole = 0;
-    double worst = 0.0;
+    int whole = 0, wrong = 0;
     for (int i = 0; i < N; i++) {
         if (out_confidence[i] < 0.6f) continue;
+        double off = 0.0;
+        for (int c = 0; c < 3; c++) off = fmax(off, fabs((double)(out_color[3 * i + c] - color[3][3 * i + c])));
+        wrong += off > 0.02;
         whole++;
-        for (int c = 0; c < 3; c++) worst = fmax(worst, fabs((double)(out_color[3 * i + c] - color[3][3 * i + c]) - 0.1));
+    }
+    CHECK(whole > N * 8 / 10 && wrong <= N / 1000); // stereo finds no exact depth at the photos' borders
+    warp.end_fn(warp.user, ctx);
+    CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 1));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
+    whole = 0;
+    for (int i = 0; i < N; i++) {
+        if (out_confidence[i] <= 0.0f) continue;
+        const double share = (double)(out_color[3 * i + 1] - 0.1f) / (double)color[3][3 * i + 1]; // of the green
+        CHECK(out_confidence[i] < 0.5f && fabs((double)(out_color[3 * i] - render[3][3 * i])) < 0.02);
+        CHECK(color[3][3 * i + 1] < 0.3f || (share > 0.5 && share < 0.7)); // not trusted fully
+        whole++;
     }
     CHECK(whole > N * 8 / 10);
-    CHECK_NEAR(worst, 0.0, 0.02);
     // a reference with a very different viewing direction contributes almost nothing
     warp.end_fn(warp.user, ctx);
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references + 2, 1));
@@ -254,10 +267,11 @@ static void test_warp_refutes(gsf_context* ctx) {
                 CHECK(photos == 2 ? out_confidence[at] > 0.95f : out_confidence[at] < 0.8f);
             }
         CHECK_NEAR(worst, 0.0, photos == 2 ? 0.03 : 1e-6);
-        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // pixels next to it do not change
+        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], photos == 2 ? 0.01 : 1e-6); // next to it
         warp.end_fn(warp.user, ctx);
     }
-    // the second photo shows leaves at most 4 pixels away as well: the splat is kept
+    // photos that do not match verify nothing, and the second one shows leaves at most 4 pixels away: the splat is kept
+    for (int i = 0; i < 3 * N; i++) color[1][i] = 1.0f - color[1][i];
     for (int i = 0; i < N; i++)
         if (i % W % 8 < 4) depth[1][i] /= 1.2f;
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
@@ -944,9 +958,9 @@ static void test_mixed_windows(gsf_context* ctx) {
     mixed_setup(ctx, &r);
     gsf_fixer* all = run_mixed(ctx, &r, 0.0f, 0, 0);
     CHECK(r.checked == 4); // the photos at both ends of the path
-    gsf_fixer* some = run_mixed(ctx, &r, 17.0f, 2, 0); // the windows agree to 28 and 20 dB, then 13 and 11
+    gsf_fixer* some = run_mixed(ctx, &r, 22.0f, 2, 0); // the windows agree to 27 and 26 dB, then 19 and 12
     CHECK(r.checked == 2); // only the second end's window is restored
-    gsf_fixer* resumed = run_mixed(ctx, &r, 17.0f, 2, 1);
+    gsf_fixer* resumed = run_mixed(ctx, &r, 22.0f, 2, 1);
     CHECK(same_splats(some, resumed) && !same_splats(some, all));
     gsf_splat_destroy_fixer(ctx, all);
     gsf_splat_destroy_fixer(ctx, some);
@@ -990,7 +1004,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
     desc.train.iterations = 12;
     desc.first_round = 3;
     desc.last_round = 6;
-    desc.skip_psnr = 17.0f; // two of the four windows agree and are skipped, in each of the two rounds
+    desc.skip_psnr = 22.0f; // two of the four windows agree and are skipped, in each of the two rounds
     for (int i = 0; i < 3; i++) { // a wrapper that reports `explains`; one that does not; warp itself
         wrapped* w = all + i;
         const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end};

@@ -123,11 +123,13 @@ enum { SIDE = 8, PIXELS = SIDE * SIDE };
 static int warp_shows_near(int near_percent, int far_percent) {
     static float color[2][3 * PIXELS], depth[2][PIXELS], inv_z[2 * PIXELS];
     static uint8_t score[2][PIXELS];
-    gsf__warp_reference references[2];
-    gsf__warp warp;
+    gsf__carry_reference references[2];
+    gsf__carrier carrier;
+    gsf__warp_job job;
     gsf_camera camera;
     memset(references, 0, sizeof references);
-    memset(&warp, 0, sizeof warp);
+    memset(&carrier, 0, sizeof carrier);
+    memset(&job, 0, sizeof job);
     memset(&camera, 0, sizeof camera);
     camera.w2c[0] = camera.w2c[5] = camera.w2c[10] = camera.w2c[15] = 1.0;
     camera.width = camera.height = SIDE;
@@ -145,14 +147,13 @@ static int warp_shows_near(int near_percent, int far_percent) {
             inv_z[k * PIXELS + i] = 1.0f / (float)(k + 1);
         }
     }
-    warp.references = references;
-    warp.count = 2;
-    const int32_t nearest[GSF__WARP_NEAREST] = {0, 1};
-    const double center[3] = {0.0, 0.0, 0.0};
+    carrier.references = references;
+    carrier.count = job.near_count = 2;
+    job.carrier = &carrier;
+    job.nearest[1] = 1;
     const int32_t x = SIDE / 2, y = SIDE / 2;
     float rgb[3] = {0.0f, 0.0f, 0.0f};
-    const float confidence = gsf__warp_pixel(&warp, nearest, 2, &camera, center, x, y, inv_z + y * SIDE + x, PIXELS, 5.0f,
-                                             rgb);
+    const float confidence = gsf__warp_pixel(&job, &camera, x, y, inv_z + y * SIDE + x, PIXELS, 5.0f, rgb);
     CHECK(confidence > 0.0f && rgb[0] + rgb[1] > 0.99f && rgb[0] * rgb[1] < 1e-3f);
     return rgb[0] > 0.5f;
 }
