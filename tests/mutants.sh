@@ -18,8 +18,8 @@ gsfixer.h|golden_metrics|SSIM: constants without their squares|s/c1 = 0\.01 \* 0
 gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = sin\(angle \* \(1\.0 - t\)\) \/ sin\(angle\);/wa = 1.0 - t;/
 gsfixer_traj.h|golden_traj|windows overlap by one frame less|s/each = shared \/ \((\w+\.)?windows - 1\);/each = shared \/ ($1windows - 1) - 1;/
 gsfixer_traj.h|test_rules|restored views weigh t^2, not t (2 - t)|s/t \* \(2\.0f - t\)/t * t/
-gsfixer_splat.h|test_rules|photos and restored views averaged together|s/grad_sum\[k\]\[i\] \/ \(float\)model->visits\[k\]\[i\]/grad_sum[k][i] \/ (float)(model->visits[0][i] + model->visits[1][i])/
-gsfixer_splat.h|test_rules|restored views counted as photos|s/model->grad_sum\[k\]\[i\] \+= norm/model->grad_sum[0][i] += norm/
+gsfixer_splat.h|test_rules|photos and restored views averaged together|s/densify_mean\(model->grad_sum\[k\]\[i\], model->visits\[k\]\[i\]\)/densify_mean(model->grad_sum[k][i], model->visits[0][i] + model->visits[1][i])/
+gsfixer_splat.h|test_rules|restored views counted as photos|s/model->grad_sum\[k\]\[i\] \+= gsf__visit_grad/model->grad_sum[0][i] += gsf__visit_grad/
 gsfixer_splat.h|test_rules|an origin from 2000 extents on|s/distance > 1000\.0 \* extent/distance > 2000.0 * extent/
 gsfixer_splat.h|test_rules|warp: a nearer group needs half the weight|s/(define GSF__WARP_GROUP_SHARE) 0\.35f/$1 0.5f/
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/
