@@ -41,9 +41,10 @@ static const option_spec option_specs[] = {
      "use the photos in images_N/ or, if there are none, shrink them N times"},
     {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset",
      "shrink photos whose longer side exceeds this"},
-    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
-     "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
-     "diffusion model; exec is a program of yours, run as COMMAND JOBDIR"},
+    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", "fix restore",
+     "what repairs the rendered frames (fix: none by default): warp reprojects the photos; mini is a small network that\n"
+     "blends them (FILE: its weights, a safetensors file); dit is the paper's video diffusion model; exec is a program of\n"
+     "yours, run as COMMAND JOBDIR"},
     {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
      "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
@@ -443,6 +444,10 @@ gsf_traj_kind gsfix_path_kind(const char* name) {
                                                    : GSF_TRAJ_INTERPOLATE;
 }
 
+static int is_mini(const char* restorer) { // mini or mini:FILE
+    return strcmp(restorer, "mini") == 0 || (strncmp(restorer, "mini:", 5) == 0 && restorer[5]);
+}
+
 int gsfix_check_restorer(gsfix_app* app) {
     const char* r = app->o.restorer;
     const gsfix_options* o = &app->o;
@@ -464,9 +469,20 @@ int gsfix_check_restorer(gsfix_app* app) {
                         : o->any_frames             ? "--any-frames"
                                                     : NULL;
     if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
-    if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
+    if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0 || is_mini(r)) return 0;
     if (strncmp(r, "exec:", 5) == 0 && r[5]) return 0;
-    return gsfix_misused(app, "--restorer %s: choose from none|warp|dit:MODEL_DIR|exec:COMMAND", r);
+    return gsfix_misused(app, "--restorer %s: choose from none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", r);
+}
+
+#ifndef GSFIX_MODELS // the folder of the weights that come with the source code
+#define GSFIX_MODELS "examples/models"
+#endif
+
+// mini:FILE, else mini.safetensors in the folder named by the environment variable GSFIX_MODELS or in that of the source code
+gsfix_path gsfix_mini_path(const char* restorer) {
+    const char* folder = getenv("GSFIX_MODELS");
+    if (restorer[4] == ':') return gsfix_pathf("%s", restorer + 5);
+    return gsfix_pathf("%s/mini.safetensors", folder && folder[0] ? folder : GSFIX_MODELS);
 }
 
 const char* const gsfix_conditions[4] = {"both", "2d", "3d", "none"};
@@ -559,6 +575,13 @@ gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present) 
     *present = r && strcmp(r, "none") != 0;
     if (!*present) return GSF_OK;
     if (strcmp(r, "warp") == 0) return gsf_splat_make_warp(&app->ctx, out);
+    if (is_mini(r)) {
+        gsf_nn_mini_desc desc;
+        const gsfix_path path = gsfix_mini_path(r);
+        memset(&desc, 0, sizeof desc);
+        desc.path = path.s;
+        return gsf_nn_make_mini(&app->ctx, &desc, out);
+    }
     if (strncmp(r, "dit:", 4) == 0) {
         gsf_nn_dit_desc desc = gsfix_dit_desc(app);
         const gsfix_path checkpoint = gsfix_pathf("%s/dit.checkpoint", app->o.out);
@@ -580,6 +603,7 @@ gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and the checkpoints of
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
     if (!restorer->user) return;
     if (strcmp(app->o.restorer, "warp") == 0) gsf_splat_destroy_warp(&app->ctx, restorer);
+    else if (is_mini(app->o.restorer)) gsf_nn_destroy_mini(&app->ctx, restorer);
     else if (strncmp(app->o.restorer, "dit:", 4) == 0) gsf_nn_destroy_dit(&app->ctx, restorer);
     else gsfix_destroy_exec(&app->ctx, restorer);
 }

@@ -14,7 +14,13 @@
 #include "make_scene.c"
 
 enum { DATA_REFERENCES = 3, DATA_FRAME = GSF__MINI_FRAME + 3, DATA_PIXEL = DATA_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE };
-enum { DATA_LONG = 216, DATA_SHORT = 144, DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
+enum { DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
+
+typedef struct data_desc { // of all scenes
+    const char* dir;
+    int pixels;      // the longer side; the other is two thirds of it
+    int fit;         // step of the last round
+} data_desc;
 
 static int data_is_signed(int plane) { // of a reference: kept within [-1,1]
     return (plane >= 3 && plane < 6) || plane == 7 || plane == 13;
@@ -116,14 +122,14 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
 }
 
 // The scene's options, from its seed: the layouts take turns.
-static make_scene_options data_options(uint64_t seed) {
+static make_scene_options data_options(const data_desc* d, uint64_t seed) {
     make_scene_options o = make_scene_defaults;
     const int upright = gsf_draw_uniform(seed, 1, 0) < 0.3;
     o.seed = seed;
     o.layout = 1 + (int)(seed % (LAYOUTS - 1));
     o.views = DATA_VIEWS;
-    o.width = upright ? DATA_SHORT : DATA_LONG;
-    o.height = upright ? DATA_LONG : DATA_SHORT;
+    o.width = upright ? 2 * d->pixels / 3 : d->pixels;
+    o.height = upright ? d->pixels : 2 * d->pixels / 3;
     o.points = 1500;
     o.arc = 60.0 + 140.0 * gsf_draw_uniform(seed, 1, 1);
     o.drift = gsf_draw_uniform(seed, 1, 2) < 0.4 ? 0.8 * gsf_draw_uniform(seed, 1, 3) : 0.0;
@@ -131,8 +137,9 @@ static make_scene_options data_options(uint64_t seed) {
 }
 
 // Runs the loop with the probe until its last round is over.
-static gsf_result data_run(gsf_context* ctx, uint64_t seed, const char* folder, const make_scene_options* o, data_probe* p) {
+static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o, data_probe* p) {
     static const size_t views_of[6] = {3, 3, 4, 5, 6, 9};
+    const uint64_t seed = o->seed;
     gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};
     uint32_t train[DATA_VIEWS], test[DATA_VIEWS];
     size_t count, held_out;
@@ -155,10 +162,10 @@ static gsf_result data_run(gsf_context* ctx, uint64_t seed, const char* folder, 
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
     gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_EXACT);
-    desc.train.iterations = 700;
+    desc.train.iterations = d->fit + 101;
     desc.train.seed = seed;
-    desc.first_round = 199;
-    desc.last_round = 599;
+    desc.first_round = d->fit / 3;
+    desc.last_round = d->fit;
     desc.windows = count < DATA_WINDOWS ? (int32_t)count : DATA_WINDOWS;
     desc.window_frames = DATA_WINDOW;
     if (result == GSF_OK) result = gsf_splat_make_fixer(ctx, &desc, views, count, &start, &restorer, &fixer);
@@ -173,22 +180,20 @@ static gsf_result data_run(gsf_context* ctx, uint64_t seed, const char* folder, 
 }
 
 // Makes the scene of a seed: DIR/scenes/SEED and then the file `path`.
-static gsf_result make_data(gsf_context* ctx, uint64_t seed, const char* dir, const char* path) {
-    const make_scene_options o = data_options(seed);
-    char folder[2048];
+static gsf_result make_data(gsf_context* ctx, const data_desc* d, uint64_t seed, const char* path) {
+    const make_scene_options o = data_options(d, seed);
+    char folder[1024];
     world s;
     data_probe p;
     memset(&s, 0, sizeof s);
     memset(&p, 0, sizeof p);
-    snprintf(folder, sizeof folder, "%s/scenes/%llu", dir, (unsigned long long)seed);
-    char above[2048];
-    snprintf(above, sizeof above, "%s/scenes", dir);
-    if (!make_folder(dir, "") || !make_folder(above, "") || make_scene(ctx, &o, folder) != 0)
+    snprintf(folder, sizeof folder, "%s/scenes/%llu", d->dir, (unsigned long long)seed);
+    if (!make_folder(d->dir, "") || !make_folder(d->dir, "/scenes") || make_scene(ctx, &o, folder) != 0)
         return gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot make the scene", folder);
     p.s = &s;
     p.help = gsf_draw_uniform(seed, 1, 4) < 0.5;
     gsf_result result = start_world(ctx, &s, &o) ? GSF_OK : gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: no scene", folder);
-    if (result == GSF_OK) result = data_run(ctx, seed, folder, &o, &p);
+    if (result == GSF_OK) result = data_run(ctx, d, folder, &o, &p);
     gsf_nn_tensor frames;
     memset(&frames, 0, sizeof frames);
     frames.name = "frames";

@@ -4,11 +4,13 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
+           [--pixels 216] [--fit 599]
 
    DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on the
    former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume continues
    from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs with other
-   numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file. */
+   numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
+   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L
 #endif
@@ -25,7 +27,7 @@ typedef struct seeds { uint64_t first, last; } seeds;
 typedef struct options {
     const char *out, *data, *init;
     seeds scenes, check;
-    int steps, batch, crop, save_every, threads, resume, make_only;
+    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit;
     uint64_t seed;
     double rate;
 } options;
@@ -57,7 +59,8 @@ static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
     snprintf(path, sizeof path, "%s/%llu.safetensors", t->o.data, (unsigned long long)seed);
     struct stat there;
     if (stat(path, &there) != 0) {
-        const gsf_result made = make_data(&t->ctx, seed, t->o.data, path);
+        const data_desc desc = {t->o.data, t->o.pixels, t->o.fit};
+        const gsf_result made = make_data(&t->ctx, &desc, seed, path);
         if (made != GSF_OK) return made;
         fprintf(stderr, "train_mini: scene %llu, %.1f CPU minutes\n", (unsigned long long)seed, cpu_minutes());
     }
@@ -255,7 +258,7 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick]\n"
                 "       [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -294,16 +297,18 @@ static int parse_options(int argc, char** argv, options* o) {
             else if (strcmp(name, "--seed") == 0) o->seed = (uint64_t)x;
             else if (strcmp(name, "--save-every") == 0) o->save_every = (int)x;
             else if (strcmp(name, "--threads") == 0) o->threads = (int)x;
+            else if (strcmp(name, "--pixels") == 0) o->pixels = (int)x;
+            else if (strcmp(name, "--fit") == 0) o->fit = (int)x;
             else return 0;
         }
     }
     return o->out && o->data && seed_count(o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
-           o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->crop <= DATA_SHORT;
+           o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 && 2 * o->pixels / 3 >= o->crop;
 }
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 1, 1e-3};
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;
