@@ -18984,7 +18984,7 @@ static gsf_result gsf__mini_make_tensor(void* user, const char* name, int32_t ra
         const double normal = gsf_draw_normal(m->seed, m->count, (uint64_t)i);
         m->values[m->used + (size_t)i] = still && strncmp(name, "reference.second", 16) != 0
                                              ? 0.0f
-                                             : (float)(normal * sqrt(2.0 / (double)inputs));
+                                             : (float)(normal * sqrt(1.0 / (3.0 * (double)inputs)));
         if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 0) m->values[m->used + (size_t)i] = 6.0f;
         if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 5) m->values[m->used + (size_t)i] = -3.0f;
         if (strcmp(name, "reference.second.bias") == 0) m->values[m->used + (size_t)i] = 0.0f;

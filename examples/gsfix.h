@@ -18,7 +18,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
-    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks;
+    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     int clean_iterations;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
@@ -246,8 +246,9 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
     const gsfix_history* history;
     const char* out;
     const char* switches;    // JSON object
-    gsfix_score mean, without;
+    gsfix_score mean, without, filtered;
     const gsfix_score* views; // one per test view
+    const gsfix_score* filtered_views; // likewise, of the renders that the restorer has cleaned up; NULL: --filtered not given
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;
     int32_t iterations;
