@@ -18930,7 +18930,7 @@ static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-static const double gsf__mini_loss_floor = 1e-3; // added to the render's squared error
+static const double gsf__mini_loss_floor = 1e-2; // added to the render's squared error
 
 // The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout and r->derror.
 GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* truth, gsf__mini_loss* loss) {

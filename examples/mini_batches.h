@@ -127,7 +127,7 @@ static void make_sample(void* arg, size_t sample, int32_t worker) {
     const int64_t x0 = (int64_t)((double)(width - crop + 1) * draw_of(b, sample, 3));
     const int mirror = draw_of(b, sample, 4) < 0.5, flip = draw_of(b, sample, 5) < 0.5, swap = draw_of(b, sample, 6) < 0.5;
     const tone_curve curve = draw_tone(b, sample);
-    const float truth = draw_of(b, sample, 7) < 0.08 ? (float)(0.5 + 0.5 * draw_of(b, sample, 8)) : 0.0f;
+    const float truth = draw_of(b, sample, 7) < 0.08 ? (float)(0.5 + 0.4 * draw_of(b, sample, 8)) : 0.0f;
     (void)worker;
     for (int64_t y = 0; y < crop; y++)
         for (int64_t x = 0; x < crop; x++) {

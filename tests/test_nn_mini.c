@@ -297,7 +297,7 @@ static double loss_of(const gsf__mini_run* r, const gsf__mini_input* in, const f
 #undef MISS
         }
         const double n = 3.0 * PIXELS;
-        total += (sums[1] / n / (sums[2] / n + 1e-3) + 2.0 * sums[0] / n + 0.5 * sums[4] / n + 0.02 * sums[3] / PIXELS) / BATCH;
+        total += (sums[1] / n / (sums[2] / n + 1e-2) + 2.0 * sums[0] / n + 0.5 * sums[4] / n + 0.02 * sums[3] / PIXELS) / BATCH;
     }
     return total;
 }
