@@ -14281,8 +14281,9 @@ static const gsf__nn_entry gsf__mini_level_entries[] = { // letters: a channels 
 
 // Visits all tensors of a network whose sizes are known.
 static gsf_result gsf__mini_visit(gsf__mini* net, gsf__nn_visit_fn fn, void* user) {
-    const gsf__nn_sizes sizes = {{{'r', 4 * GSF__MINI_REFERENCE}, {'h', net->hidden}, {'e', net->features}, {'w', net->width[0]},
-                                  {'s', net->shared}, {'o', 4 * GSF__MINI_HEAD}, {'c', 4 * GSF__MINI_CHOICES}, {'3', 3}}};
+    const gsf__nn_sizes sizes = {{{'r', 4 * GSF__MINI_REFERENCE}, {'h', net->hidden}, {'e', net->features},
+                                  {'w', net->width[0]}, {'s', net->shared}, {'o', 4 * GSF__MINI_HEAD},
+                                  {'c', 4 * GSF__MINI_CHOICES}, {'3', 3}}};
     GSF__TRY(gsf__nn_visit(&sizes, gsf__mini_entries, "", net, fn, user));
     for (int l = 0; l < GSF__MINI_LEVELS; l++) {
         const int64_t above = l ? net->width[l - 1] : 4 * GSF__MINI_FRAME + 2 * net->features;
@@ -14486,9 +14487,11 @@ static void gsf__mini_assemble_row(void* arg, size_t index, int32_t worker) {
             float* to = r->frame + ((b * h + y) * w + x / 2) * pitch + part * GSF__MINI_FRAME;
             memcpy(to, frame, GSF__MINI_FRAME * sizeof(float));
             for (int c = 0; c < 3; c++) to[c] -= 0.5f;
-            for (int64_t k = 0; k < r->references; k++)
+            for (int64_t k = 0; k < r->references; k++) {
+                const int64_t coarse = ((b * r->references + k) * h + y) * w + x / 2;
                 gsf__mini_describe(frame, in->shown + (k * plane + from) * GSF__MINI_REFERENCE,
-                                   r->shown + ((((b * r->references + k) * h + y) * w + x / 2) * 4 + part) * GSF__MINI_REFERENCE);
+                                   r->shown + (coarse * 4 + part) * GSF__MINI_REFERENCE);
+            }
         }
 }
 
@@ -14608,7 +14611,8 @@ static gsf_result gsf__mini_run_levels(gsf__mini_run* r) {
 
 static gsf_result gsf__mini_run_heads(gsf__mini_run* r) {
     const gsf__mini* net = r->net;
-    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width, size = plane * net->shared;
+    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width;
+    const int64_t size = plane * net->shared;
     GSF__TRY(gsf__mini_convolve(r, &net->head, r->levels[0].y, r->batch, 0, 0, 0, r->head));
     if (!frames) return GSF_OK;
     GSF__TRY(gsf__mini_convolve(r, &net->head_frame, r->levels[0].y, r->batch, 0, 0, 0, r->common));
@@ -14640,7 +14644,7 @@ static gsf__mini_pixel gsf__mini_pixel_at(const gsf__mini_run* r, int64_t row, i
     return p;
 }
 
-enum { GSF__MINI_FREE = 2 }; // 1 / the factor of the free colour
+static const float gsf__mini_free = 0.5f;   // factor of the free colour
 static const float gsf__mini_least = -6.0f; // of the error's logarithm
 
 static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
@@ -14662,7 +14666,7 @@ static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
             to[2] = shown[12] > 0.0f ? choices[2] : -1e30f;
         }
         kernels->softmax(logits, n, 1.0f, weight);
-        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + weight[1] / GSF__MINI_FREE * p.head[2 + c];
+        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + weight[1] * gsf__mini_free * p.head[2 + c];
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
                 const float by = weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
@@ -14761,7 +14765,8 @@ GSF__SHARED void gsf__mini_plane_reference(const gsf_carried* c, const gsf_image
                 out[8] = expf(-12.5f * angle * angle);
             }
             if (ratio > 0.0f) {
-                for (int i = 0; i < 3; i++) out[9 + i] = gsf__mini_clamp(gsf__mini_row(&c->back_color, y)[3 * x + i], 0.0f, 1.0f);
+                const float* color = gsf__mini_row(&c->back_color, y) + 3 * x;
+                for (int i = 0; i < 3; i++) out[9 + i] = gsf__mini_clamp(color[i], 0.0f, 1.0f);
                 out[12] = 1.0f;
                 out[13] = gsf__mini_ratio(ratio, 1.0f, 0.0f);
             }
@@ -14771,7 +14776,8 @@ GSF__SHARED void gsf__mini_plane_reference(const gsf_carried* c, const gsf_image
 static gsf_result gsf__mini_check_carried(gsf_context* ctx, const gsf_carried* c, int64_t width, int64_t height) {
     if (c->reference < 0 || (gsf__mini_is_packed(&c->color, width, height, 3) &&
                              gsf__mini_is_packed(&c->residual, width, height, 3) &&
-                             gsf__mini_is_packed(&c->score, width, height, 1) && gsf__mini_is_packed(&c->depth, width, height, 1) &&
+                             gsf__mini_is_packed(&c->score, width, height, 1) &&
+                             gsf__mini_is_packed(&c->depth, width, height, 1) &&
                              gsf__mini_is_packed(&c->angle, width, height, 1) &&
                              gsf__mini_is_packed(&c->back_color, width, height, 3) &&
                              gsf__mini_is_packed(&c->back_ratio, width, height, 1)))
@@ -14794,15 +14800,17 @@ static gsf_result gsf__mini_query(void* user, gsf_context* ctx, int32_t frame_co
     run.width = gsf__mini_extended(width);
     run.height = gsf__mini_extended(height);
     const double pixels = (double)run.width * (double)run.height, e = (double)r->net.features;
-    double products = (double)r->net.hidden * (4.0 * GSF__MINI_REFERENCE + 9.0 * e) + (double)r->net.shared * (9.0 * e + 12.0);
+    const double seen = (double)(4 * (int64_t)GSF__MINI_REFERENCE), frame = (double)(4 * (int64_t)GSF__MINI_FRAME);
+    double products = (double)r->net.hidden * (seen + 9.0 * e) + (double)r->net.shared * (9.0 * e + 12.0);
     products = products * r->desc.references + 9.0 * (double)(r->net.width[0] * r->net.shared);
     for (int l = 0; l < GSF__MINI_LEVELS; l++) {
-        const double w = (double)r->net.width[l], above = l ? (double)r->net.width[l - 1] : 4.0 * GSF__MINI_FRAME + 2.0 * e;
+        const double w = (double)r->net.width[l], above = l ? (double)r->net.width[l - 1] : frame + 2.0 * e;
         const double blocks = r->net.blocks[l] + (l + 1 < GSF__MINI_LEVELS);
         products += (9.0 * w * above + 18.0 * w * w * blocks + w * w) / (double)(1 << 2 * l);
     }
     out->flops = frame_count * 0.5 * pixels * products;
-    out->bytes = 4.0 * (double)gsf__mini_lay_out(&run, NULL) + 4.0 * pixels * (GSF__MINI_FRAME + (double)GSF__MINI_REFERENCE * r->desc.references);
+    const int64_t planes = GSF__MINI_FRAME + GSF__MINI_REFERENCE * (int64_t)r->desc.references;
+    out->bytes = 4.0 * (double)gsf__mini_lay_out(&run, NULL) + 4.0 * pixels * (double)planes;
     return GSF_OK;
 }
 
@@ -18753,8 +18761,8 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
         float *dhead = r->dhead + (p.head - r->head), mean = 0.0f;
         memset(slope, 0, sizeof slope);
         for (int c = 0; c < 3; c++) {
-            slope[1] += dout[c] / GSF__MINI_FREE * p.head[2 + c];
-            dhead[2 + c] = weight[1] / GSF__MINI_FREE * dout[c];
+            slope[1] += dout[c] * gsf__mini_free * p.head[2 + c];
+            dhead[2 + c] = weight[1] * gsf__mini_free * dout[c];
         }
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
@@ -18775,7 +18783,8 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
 
 static gsf_result gsf__mini_heads_grad(gsf__mini_run* r, gsf__nn_params* params) { // to levels[0].dy and dfeatures
     const gsf__mini* net = r->net;
-    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width, size = plane * net->shared;
+    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width;
+    const int64_t size = plane * net->shared;
     float* dy = r->levels[0].dy;
     GSF__TRY(gsf__mini_convolve_grad(r, params, &net->head, r->levels[0].y, r->batch, 0, 0, r->dhead, 0, dy));
     if (!frames) return GSF_OK;

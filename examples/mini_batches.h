@@ -89,12 +89,15 @@ static void vary_references(const mini_batch* b, size_t sample, mini_sample s) {
     const int64_t pixels = b->crop * b->crop;
     for (int r = 0; r < DATA_REFERENCES; r++) {
         const double what = draw_of(b, sample, 20 + 3 * r);
-        const float gain = draw_of(b, sample, 21 + 3 * r) < 0.25 ? (float)exp(0.16 * draw_of(b, sample, 22 + 3 * r) - 0.08) : 1.0f;
+        const int exposed = draw_of(b, sample, 21 + 3 * r) < 0.25;
+        const float gain = exposed ? (float)exp(0.16 * draw_of(b, sample, 22 + 3 * r) - 0.08) : 1.0f;
         for (int64_t i = 0; i < pixels; i++) {
             float* p = s.shown + (r * pixels + i) * GSF__MINI_REFERENCE;
             if (what < 0.2) hide_reference(p, what < 0.16, what < 0.12 || what >= 0.16);
-            if (gain != 1.0f)
-                for (int c = 0; c < 3; c++) p[c] = gsf__mini_clamp(gain * p[c], 0.0f, 1.0f), p[9 + c] = gsf__mini_clamp(gain * p[9 + c], 0.0f, 1.0f);
+            for (int c = 0; c < 3 && exposed; c++) {
+                p[c] = gsf__mini_clamp(gain * p[c], 0.0f, 1.0f);
+                p[9 + c] = gsf__mini_clamp(gain * p[9 + c], 0.0f, 1.0f);
+            }
         }
     }
 }
@@ -102,8 +105,10 @@ static void vary_references(const mini_batch* b, size_t sample, mini_sample s) {
 // A hole in the splats: a rectangle of one colour without depth.
 static void cut_hole(const mini_batch* b, size_t sample, mini_sample s) {
     const int64_t crop = b->crop, pixels = crop * crop;
-    const int64_t w = (int64_t)((double)crop * (0.08 + 0.4 * draw_of(b, sample, 41))), h = (int64_t)((double)crop * (0.08 + 0.4 * draw_of(b, sample, 42)));
-    const int64_t x0 = (int64_t)((double)(crop - w) * draw_of(b, sample, 43)), y0 = (int64_t)((double)(crop - h) * draw_of(b, sample, 44));
+    const int64_t w = (int64_t)((double)crop * (0.08 + 0.4 * draw_of(b, sample, 41)));
+    const int64_t h = (int64_t)((double)crop * (0.08 + 0.4 * draw_of(b, sample, 42)));
+    const int64_t x0 = (int64_t)((double)(crop - w) * draw_of(b, sample, 43));
+    const int64_t y0 = (int64_t)((double)(crop - h) * draw_of(b, sample, 44));
     for (int64_t y = y0; y < y0 + h; y++)
         for (int64_t x = x0; x < x0 + w; x++) {
             float* f = s.frame + (y * crop + x) * GSF__MINI_FRAME;
@@ -135,7 +140,8 @@ static void make_sample(void* arg, size_t sample, int32_t worker) {
             const int64_t row = frame * height + y0 + (flip ? crop - 1 - v : v), column = x0 + (mirror ? crop - 1 - u : u);
             read_pixel((const uint8_t*)t->data + (row * width + column) * DATA_PIXEL, s, at, pixels);
             tone_pixel(&curve, s, at, pixels);
-            for (int c = 0; c < 3; c++) s.frame[at * GSF__MINI_FRAME + c] += truth * (s.truth[3 * at + c] - s.frame[at * GSF__MINI_FRAME + c]);
+            float* render = s.frame + at * GSF__MINI_FRAME;
+            for (int c = 0; c < 3; c++) render[c] += truth * (s.truth[3 * at + c] - render[c]);
         }
     vary_references(b, sample, s);
     if (draw_of(b, sample, 40) < 0.25) cut_hole(b, sample, s);

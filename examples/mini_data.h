@@ -4,7 +4,8 @@
    path as a restorer gets them, just before the loop's rounds, with the photos carried into them and the ray-traced truth.
    The file of a scene has one tensor, "frames": u8 (frames, height, width, 50), per pixel
 
-       render 3 | alpha | nearness | truth 3 | 3 times: photo 3, residual 3, score, depth ratio, angle, photo back 3, valid, ratio
+       render 3 | alpha | nearness | truth 3 |
+       3 times: photo 3, residual 3, score, depth ratio, angle, photo by the frame's depth 3, its validity, its depth ratio
 
    that is the planes of gsf__mini_input, those within [-1,1] shifted by 128. */
 #ifndef MINI_DATA_H
@@ -112,8 +113,8 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
         if (taken) result = probe_frame(ctx, p, w, i, planes, truth);
         for (int64_t k = 0; k < pixels; k++) {
             confidence[k] = p->help && taken ? 0.5f : 0.0f;
-            for (int c = 0; c < 3; c++)
-                color[3 * k + c] = ((const float*)w->color[i].data)[3 * k + c] * 0.5f + (taken ? (float)truth[3 * k + c] : 0.0f) / 510.0f;
+            for (int64_t c = 3 * k; c < 3 * k + 3; c++)
+                color[c] = ((const float*)w->color[i].data)[c] * 0.5f + (taken ? (float)truth[c] : 0.0f) / 510.0f;
         }
     }
     gsf_free(ctx, planes);
@@ -137,7 +138,8 @@ static make_scene_options data_options(const data_desc* d, uint64_t seed) {
 }
 
 // Runs the loop with the probe until its last round is over.
-static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o, data_probe* p) {
+static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o,
+                           data_probe* p) {
     static const size_t views_of[6] = {3, 3, 4, 5, 6, 9};
     const uint64_t seed = o->seed;
     gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};

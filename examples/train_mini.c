@@ -3,13 +3,13 @@
    (with Embree, which traces the rays faster: -DGSF_USE_EMBREE and -lembree3 or -lembree4)
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
-           [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
+           [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
            [--pixels 216] [--fit 599]
 
-   DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on the
-   former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume continues
-   from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs with other
-   numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
+   DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
+   the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume
+   continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs
+   with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
    --pixels: longer side of the photos; --fit: step of the last round, of which there are three. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L
@@ -189,8 +189,8 @@ static gsf_result train(training* t) {
         counted++;
         if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
             fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f\n",
-                    (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted, decibels(sum.before / counted),
-                    decibels(sum.square / counted), sum.likelihood / counted);
+                    (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
+                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted);
             memset(&sum, 0, sizeof sum);
             counted = 0;
         }
@@ -217,7 +217,8 @@ static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_te
     *before = *after = 0.0;
     for (int64_t f = 0; f < frames->shape[0] && result == GSF_OK; f++) {
         double squares[2] = {0.0, 0.0};
-        for (int64_t i = 0; i < pixels; i++) read_pixel((const uint8_t*)frames->data + (f * pixels + i) * DATA_PIXEL, s, i, pixels);
+        const uint8_t* from = (const uint8_t*)frames->data + f * pixels * DATA_PIXEL;
+        for (int64_t i = 0; i < pixels; i++) read_pixel(from + i * DATA_PIXEL, s, i, pixels);
         result = gsf__mini_forward(&run, &input);
         for (int64_t y = 0; y < height && result == GSF_OK; y++)
             for (int64_t x = 0; x < 3 * width; x++) {
@@ -256,8 +257,8 @@ static gsf_result check(training* t) {
 // ---- command line ----------------------------------------------------------------
 
 static int usage(FILE* to) {
-    fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick]\n"
-                "       [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
+    fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
+                "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE]\n"
                 "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
@@ -303,12 +304,13 @@ static int parse_options(int argc, char** argv, options* o) {
         }
     }
     return o->out && o->data && seed_count(o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
-           o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 && 2 * o->pixels / 3 >= o->crop;
+           o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 &&
+           2 * o->pixels / 3 >= o->crop;
 }
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1e-3};
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 5e-4};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;

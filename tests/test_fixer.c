@@ -675,9 +675,8 @@ static void test_restore_views(gsf_context* ctx) {
         const int begun = r.begun;
         const int busy = stats.stage == GSF_FIX_PLAN || (stats.stage == GSF_FIX_RESTORE && stats.window < stats.windows);
         within += busy;
-        if (busy || stats.stage == GSF_FIX_RESTORE)
-            CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
-        else CHECK_OK(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences));
+        const gsf_result expected = busy || stats.stage == GSF_FIX_RESTORE ? GSF_ERROR_INVALID_ARGUMENT : GSF_OK;
+        CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences), expected);
         CHECK(r.begun - begun <= 1);
         if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, filtered, &stats))) break;
     }

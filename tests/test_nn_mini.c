@@ -77,7 +77,8 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
     enum { H = HEIGHT / 2, W = WIDTH / 2, COARSE = H * W };
     const int e = (int)t->net->features, hidden = (int)t->net->hidden, s = (int)t->net->shared, pitch = 20 + 2 * e;
     double *frame = doubles(COARSE * pitch), *features = doubles(REFERENCES * COARSE * e), *head = doubles(COARSE * 24);
-    double *choices = doubles(REFERENCES * COARSE * 12), *shown = doubles(REFERENCES * COARSE * 56), *common = doubles(COARSE * s);
+    double *choices = doubles(REFERENCES * COARSE * 12), *shown = doubles(REFERENCES * COARSE * 56);
+    double* common = doubles(COARSE * s);
     double *attention = doubles(REFERENCES * COARSE), *first = doubles(COARSE * hidden), *heads = doubles(COARSE * s);
     for (int i = 0; i < PIXELS; i++) {
         const int x = i % WIDTH, y = i / WIDTH, at = (y / 2 * W + x / 2), part = y % 2 * 2 + x % 2;
@@ -87,9 +88,16 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
             const float* p = in->shown + (k * PIXELS + i) * 14;
             double* o = shown + ((k * COARSE + at) * 4 + part) * 14;
             const double seen = p[6] > 0.0f, valid = p[12] > 0.0f;
-            for (int c = 0; c < 3; c++) o[c] = 2.0 * seen * ((double)p[c] - (double)f[c]);
-            for (int c = 0; c < 3; c++) o[3 + c] = 4.0 * seen * (double)p[3 + c], o[9 + c] = 2.0 * valid * ((double)p[9 + c] - (double)f[c]);
-            o[6] = (double)p[6], o[7] = seen * (double)p[7], o[8] = seen * (double)p[8], o[12] = valid, o[13] = valid * (double)p[13];
+            for (int c = 0; c < 3; c++) {
+                o[c] = 2.0 * seen * ((double)p[c] - (double)f[c]);
+                o[3 + c] = 4.0 * seen * (double)p[3 + c];
+                o[9 + c] = 2.0 * valid * ((double)p[9 + c] - (double)f[c]);
+            }
+            o[6] = (double)p[6];
+            o[7] = seen * (double)p[7];
+            o[8] = seen * (double)p[8];
+            o[12] = valid;
+            o[13] = valid * (double)p[13];
         }
     }
     for (int k = 0; k < REFERENCES; k++) {
@@ -104,8 +112,10 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
         double sum = 1.0, *mean = frame + i * pitch + 20, *most = mean + e;
         for (int k = 0; k < REFERENCES; k++) {
             int any = 0;
-            for (int part = 0; part < 4; part++)
-                any |= shown[((k * COARSE + i) * 4 + part) * 14 + 6] > 0.0 || shown[((k * COARSE + i) * 4 + part) * 14 + 12] > 0.0;
+            for (int part = 0; part < 4; part++) {
+                const double* o = shown + ((k * COARSE + i) * 4 + part) * 14;
+                any |= o[6] > 0.0 || o[12] > 0.0;
+            }
             double* a = attention + k * COARSE + i;
             *a = any ? exp(*a) : 0.0;
             sum += *a;
@@ -160,8 +170,9 @@ static void make_inputs(gsf__mini_input* in, int batch, int width, int height, i
         for (int i = 0; i < width * height * GSF__MINI_FRAME; i++) frame[i] = (float)test_random(&seed);
         for (int i = 0; i < references * width * height; i++) {
             float* p = shown + i * GSF__MINI_REFERENCE;
-            const int column = i % width, seen = column > 8, valid = i / width % height < height - 4; // some of both, and neither
-            for (int k = 0; k < GSF__MINI_REFERENCE; k++) p[k] = (float)test_random_in(&seed, k == 3 || k == 7 ? -1.0 : 0.1, 1.0);
+            const int seen = i % width > 8, valid = i / width % height < height - 4; // some of both, and neither
+            for (int k = 0; k < GSF__MINI_REFERENCE; k++)
+                p[k] = (float)test_random_in(&seed, k == 3 || k == 7 ? -1.0 : 0.1, 1.0);
             if (!seen || test_random(&seed) < 0.1) p[6] = 0.0f;
             p[12] = valid && test_random(&seed) < 0.8 ? 1.0f : 0.0f;
         }
@@ -266,7 +277,8 @@ static void test_gradients(gsf_context* ctx) {
             size += slope * slope;
         }
         const double relative = sqrt(miss / (size + 1e-12));
-        if (!CHECK(relative < 1e-5)) fprintf(stderr, "%s: relative error of the gradient %g\n", net.weights.tensors[i].name, relative);
+        if (!CHECK(relative < 1e-5))
+            fprintf(stderr, "%s: relative error of the gradient %g\n", net.weights.tensors[i].name, relative);
         if (relative > worst) worst = relative;
     }
     printf("gradients: worst relative L2 error of a tensor %.2e\n", worst);
@@ -318,10 +330,11 @@ static void test_loss(gsf_context* ctx) {
     CHECK_NEAR(loss.total, loss_of(&run, in, truth, 0, 0, 0.0), 1e-9);
     for (int k = 0; k < 40; k++) {
         const int at = (int)(test_random(&seed) * BATCH * PIXELS * 3), pixel = at / 3;
-        const double step = 1e-7, slope = (loss_of(&run, in, truth, 1, at, step) - loss_of(&run, in, truth, 1, at, -step)) / (2 * step);
-        const double other = (loss_of(&run, in, truth, 2, pixel, step) - loss_of(&run, in, truth, 2, pixel, -step)) / (2 * step);
-        CHECK_NEAR((double)run.dout[at], slope, 1e-7);
-        CHECK_NEAR((double)run.derror[pixel], other, 1e-7);
+        const double step = 1e-7;
+        const double color = loss_of(&run, in, truth, 1, at, step) - loss_of(&run, in, truth, 1, at, -step);
+        const double error = loss_of(&run, in, truth, 2, pixel, step) - loss_of(&run, in, truth, 2, pixel, -step);
+        CHECK_NEAR((double)run.dout[at], color / (2.0 * step), 1e-7);
+        CHECK_NEAR((double)run.derror[pixel], error / (2.0 * step), 1e-7);
     }
     gsf__mini_end(&run);
     gsf__mini_close(ctx, &net);
@@ -343,8 +356,10 @@ static void test_start(gsf_context* ctx) {
     CHECK_OK(ctx, gsf__mini_forward(&run, &in));
     double most = 0.0;
     for (int64_t y = 0; y < H; y++)
-        for (int64_t x = 0; x < 3 * W; x++)
-            most = fmax(most, fabs((double)(run.out[y * 3 * run.width + x] - in.frame[(y * W + x / 3) * GSF__MINI_FRAME + x % 3])));
+        for (int64_t x = 0; x < 3 * W; x++) {
+            const float before = in.frame[(y * W + x / 3) * GSF__MINI_FRAME + x % 3];
+            most = fmax(most, fabs((double)(run.out[y * 3 * run.width + x] - before)));
+        }
     CHECK(most < 0.025);
     gsf__mini_end(&run);
     gsf__mini_close(ctx, &net);
@@ -379,11 +394,14 @@ static void test_order(gsf_context* ctx, const gsf__mini* net) {
 
 // ---- the restorer ----------------------------------------------------------------
 
-typedef struct clip { float color[3 * PIXELS], alpha[PIXELS], depth[PIXELS], out[3 * PIXELS], weight[PIXELS], carried[13 * PIXELS]; } clip;
+typedef struct clip {
+    float color[3 * PIXELS], alpha[PIXELS], depth[PIXELS], out[3 * PIXELS], weight[PIXELS], carried[13 * PIXELS];
+} clip;
 
 static gsf_result carry(void* user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out) {
     clip* c = (clip*)user;
-    gsf_image* const images[] = {&out->color, &out->residual, &out->back_color, &out->score, &out->depth, &out->angle, &out->back_ratio};
+    gsf_image* const images[] = {&out->color, &out->residual, &out->back_color, &out->score,
+                                 &out->depth, &out->angle, &out->back_ratio};
     float* at = c->carried;
     (void)ctx, (void)frame;
     out->reference = slot < 2 ? slot : -1;
@@ -395,9 +413,9 @@ static gsf_result carry(void* user, gsf_context* ctx, int32_t frame, int32_t slo
 }
 
 static void run_restorer(gsf_context* ctx, const gsf_restorer* mini, clip* c, gsf_result expected, int carried) {
-    gsf_image images[5] = {gsf_wrap_image(c->color, GSF_F32, WIDTH, HEIGHT, 3), gsf_wrap_image(c->alpha, GSF_F32, WIDTH, HEIGHT, 1),
-                           gsf_wrap_image(c->depth, GSF_F32, WIDTH, HEIGHT, 1), gsf_wrap_image(c->out, GSF_F32, WIDTH, HEIGHT, 3),
-                           gsf_wrap_image(c->weight, GSF_F32, WIDTH, HEIGHT, 1)};
+    float* const data[5] = {c->color, c->alpha, c->depth, c->out, c->weight};
+    gsf_image images[5];
+    for (int i = 0; i < 5; i++) images[i] = gsf_wrap_image(data[i], GSF_F32, WIDTH, HEIGHT, i == 0 || i == 3 ? 3 : 1);
     gsf_restore_window w;
     gsf_restorer_info info;
     memset(&w, 0, sizeof w);
@@ -458,7 +476,8 @@ static void test_restorer(gsf_context* ctx) {
     gsf_nn_tensor* tensors = (gsf_nn_tensor*)malloc((net.weights.tensor_count + 1) * sizeof *tensors);
     for (int fault = 0; fault < 5; fault++) { // a tensor less, one more, of another shape, of another type; a NaN
         static float surplus[1];
-        size_t count = net.weights.tensor_count, at = (size_t)(gsf_nn_find_tensor(&net.weights, "head.bias") - net.weights.tensors);
+        size_t count = net.weights.tensor_count;
+        const size_t at = (size_t)(gsf_nn_find_tensor(&net.weights, "head.bias") - net.weights.tensors);
         float broken[24];
         memcpy(tensors, net.weights.tensors, count * sizeof *tensors);
         if (fault == 0) tensors[at] = tensors[--count];
