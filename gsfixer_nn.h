@@ -61,9 +61,9 @@
                kernels    >>nn activations >>nn norms >>nn linear >>nn int8 >>nn attention >>nn convolution >>nn positions
                layers     >>nn layers
                networks   >>nn image encoders >>nn bpe >>nn captioner >>nn tokenizer >>nn t5 >>nn vae >>nn transformer
-               restoring  >>nn scheduler >>nn sampling >>nn restorer
+               restoring  >>nn scheduler >>nn sampling >>nn restorer >>nn mini
                measuring  >>nn metrics
-               training   >>nn training: gradients of layers and of the transformer, AdamW; with GSF_NN_TRAINING only
+               training   >>nn training: gradients of layers, of the transformer and of mini, AdamW; with GSF_NN_TRAINING only
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -604,6 +604,27 @@ typedef struct gsf_nn_dit_desc {
 // "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
+
+// ---- the restorer `mini` --------------------------------------------------------------
+
+typedef struct gsf_nn_mini_desc {
+    const char* path;        // safetensors file of examples/train_mini.c
+    const void* data;        // its bytes, which the caller keeps until the restorer is destroyed; NULL: read the file
+    size_t size;
+    float sigma;             // expected error of a colour at which a pixel has half its weight in training; 0: 0.05
+    int32_t references;      // photos that a frame is made from, the nearest ones, at most 16; 0: 3
+} gsf_nn_mini_desc;
+
+/* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
+   the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains.
+   It takes frames of any size and any number. A host embeds it in three lines:
+       gsf_nn_mini_desc desc = {0};
+       desc.data = bytes, desc.size = byte_count;    // or desc.path
+       gsf_nn_make_mini(&ctx, &desc, &restorer);
+   A file that is not such a network gives GSF_ERROR_FORMAT and the name of a tensor; a clip without carried photos, depth
+   or opacity GSF_ERROR_UNSUPPORTED; a NaN or infinity GSF_ERROR_NUMERIC. */
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* desc, gsf_restorer* out);
+GSF_API void gsf_nn_destroy_mini(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- metrics that need networks -------------------------------------------------------
 /* One object measures one stream of frames, which are never held together: zero it, choose the kind and the folder with
@@ -14683,6 +14704,748 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
     return result;
 }
 
+// ---- >>nn mini ------------------------------------------------------------------
+
+/* A small network that repairs a frame by blending what photos show in it. For every pixel it weighs candidates:
+       the render; the render plus a free colour; per reference the photo carried through the photo's own depth, the render
+       plus the reference's carried residual, and the photo at the point that the frame's depth shows.
+   The output is their mean by a softmax of weights, so that the colours are those of photos, and the network has to find
+   only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made.
+
+       planes of each reference -> unshuffle 2 -> 1x1 -> 3x3 -> features --+--> mean by softmax, maximum --+
+                                                                            |                              v
+       planes of the frame ------> unshuffle 2 -------------------------------------------------------> 3x3 -> U-Net
+                                                                            |                              |
+       weights of a reference's candidates <--- 1x1 <--- 3x3 <--------------+------------------------------+
+       weights of the others, free colour, log error <--- 1x1 <--------------------------------------------+
+
+   References share all weights, so any number of them is allowed, in any order. Sizes are read from the tensors. All layers
+   are convolutions of gsf__nn_convolve; the first level of the U-Net is at half the frame's size, each other at half the one
+   above. A frame is extended to multiples of 16 pixels by repeating its last row and column. */
+enum {
+    GSF__MINI_LEVELS = 4,
+    GSF__MINI_BLOCKS = 2,                       // residual blocks of a level on the way down, at most
+    GSF__MINI_FRAME = 5, GSF__MINI_REFERENCE = 14, // planes, see gsf__mini_input
+    GSF__MINI_HEAD = 6, GSF__MINI_CHOICES = 3,  // outputs per pixel; weights per pixel and reference
+    GSF__MINI_MULTIPLE = 16,                    // of a frame's sides, inside the network
+    GSF__MINI_MOST = 16,                        // references of a frame
+    GSF__MINI_CHANNELS = 512,                   // of a layer
+};
+
+typedef struct gsf__mini_input { // what the network sees of one frame; planes are interleaved
+    int64_t width, height;
+    int32_t references;
+    const float* frame; // (height, width, 5): render 3, alpha, mean inverse depth's quarter of the inverse depth (0: none)
+    const float* shown; // (references, height, width, 14): photo 3, residual 3, score, depth ratio, angle: 1 = none; photo by
+                        // the frame's depth 3, its validity, its depth ratio. Ratios: 4 times the logarithm, within [-1,1]
+} gsf__mini_input;
+
+typedef struct gsf__mini_block { gsf__nn_layer first, second; } gsf__mini_block; // x += second(relu(first(relu(x))))
+
+typedef struct gsf__mini_level {
+    gsf__nn_layer down;                      // from the level above; of the first one from the inputs
+    gsf__mini_block in[GSF__MINI_BLOCKS];
+    gsf__nn_layer skip, below;               // y = skip(x) + upscaled below(y of the level below); not of the last level
+    gsf__mini_block out;
+} gsf__mini_level;
+
+typedef struct gsf__mini { // an open network
+    gsf_nn_weights weights;
+    int64_t hidden, features, shared;        // channels: of a reference's first layer, of its features, of its head
+    int64_t width[GSF__MINI_LEVELS];
+    int32_t blocks[GSF__MINI_LEVELS];        // of gsf__mini_level.in
+    gsf__nn_layer first, second, attention;  // of a reference
+    gsf__nn_layer head, head_frame, head_reference, head_blend;
+    gsf__mini_level levels[GSF__MINI_LEVELS];
+} gsf__mini;
+
+#define GSF__MINI_AT(member, form) offsetof(gsf__mini, member), form, 0
+static const gsf__nn_entry gsf__mini_entries[] = {
+    {"reference.first", "hr11", GSF__MINI_AT(first, GSF__NN_PAIR)},
+    {"reference.second", "eh33", GSF__MINI_AT(second, GSF__NN_PAIR)},
+    {"reference.attention", "1e11", GSF__MINI_AT(attention, GSF__NN_PAIR)},
+    {"head", "ow11", GSF__MINI_AT(head, GSF__NN_PAIR)},
+    {"head_frame", "sw33", GSF__MINI_AT(head_frame, GSF__NN_PAIR)},
+    {"head_reference", "se33", GSF__MINI_AT(head_reference, GSF__NN_WEIGHT)},
+    {"head_blend", "cs11", GSF__MINI_AT(head_blend, GSF__NN_PAIR)},
+    GSF__NN_END};
+#undef GSF__MINI_AT
+
+static const gsf__nn_entry gsf__mini_level_entries[] = { // letters: a channels of the level above, w of this, b below
+    {"down", "wa33", GSF__NN_AT(gsf__mini_level, down)},
+    {"in.0.first", "ww33", GSF__NN_AT(gsf__mini_level, in[0].first)},
+    {"in.0.second", "ww33", GSF__NN_AT(gsf__mini_level, in[0].second)},
+    {"in.1.first", "ww33", offsetof(gsf__mini_level, in[1].first), GSF__NN_PAIR, 'n'},
+    {"in.1.second", "ww33", offsetof(gsf__mini_level, in[1].second), GSF__NN_PAIR, 'n'},
+    {"skip", "ww11", offsetof(gsf__mini_level, skip), GSF__NN_PAIR, 'b'},
+    {"below", "wb11", offsetof(gsf__mini_level, below), GSF__NN_WEIGHT, 'b'},
+    {"out.first", "ww33", offsetof(gsf__mini_level, out.first), GSF__NN_PAIR, 'b'},
+    {"out.second", "ww33", offsetof(gsf__mini_level, out.second), GSF__NN_PAIR, 'b'},
+    GSF__NN_END};
+
+// Visits all tensors of a network whose sizes are known.
+static gsf_result gsf__mini_visit(gsf__mini* net, gsf__nn_visit_fn fn, void* user) {
+    const gsf__nn_sizes sizes = {{{'r', 4 * GSF__MINI_REFERENCE}, {'h', net->hidden}, {'e', net->features},
+                                  {'w', net->width[0]}, {'s', net->shared}, {'o', 4 * GSF__MINI_HEAD},
+                                  {'c', 4 * GSF__MINI_CHOICES}, {'3', 3}}};
+    GSF__TRY(gsf__nn_visit(&sizes, gsf__mini_entries, "", net, fn, user));
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) {
+        const int64_t above = l ? net->width[l - 1] : 4 * GSF__MINI_FRAME + 2 * net->features;
+        const gsf__nn_sizes level = {{{'a', above}, {'w', net->width[l]}, {'n', net->blocks[l] > 1},
+                                      {'b', l + 1 < GSF__MINI_LEVELS ? net->width[l + 1] : 0}, {'3', 3}}};
+        char prefix[32];
+        snprintf(prefix, sizeof prefix, "levels.%d.", l);
+        GSF__TRY(gsf__nn_visit(&level, gsf__mini_level_entries, prefix, &net->levels[l], fn, user));
+    }
+    return GSF_OK;
+}
+
+static int64_t gsf__mini_size_of(const gsf_nn_weights* weights, const char* name) { // its first dimension; 0: no such tensor
+    const gsf_nn_tensor* t = gsf_nn_find_tensor(weights, name);
+    return t && t->rank == 4 && t->shape[0] <= GSF__MINI_CHANNELS ? t->shape[0] : 0;
+}
+
+// Finds the tensors of net->weights, from which all sizes follow.
+static gsf_result gsf__mini_bind(gsf_context* ctx, gsf__mini* net) {
+    gsf__nn_loader loader;
+    char name[48];
+    net->hidden = gsf__mini_size_of(&net->weights, "reference.first.weight");
+    net->features = gsf__mini_size_of(&net->weights, "reference.second.weight");
+    net->shared = gsf__mini_size_of(&net->weights, "head_frame.weight");
+    int ok = net->hidden && net->features && net->shared;
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) {
+        snprintf(name, sizeof name, "levels.%d.down.weight", l);
+        net->width[l] = gsf__mini_size_of(&net->weights, name);
+        snprintf(name, sizeof name, "levels.%d.in.1.first.weight", l);
+        net->blocks[l] = gsf_nn_find_tensor(&net->weights, name) ? 2 : 1;
+        ok = ok && net->width[l];
+    }
+    if (!ok) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a network of the restorer mini", net->weights.name);
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
+    return gsf__nn_end_loading(&loader, gsf__mini_visit(net, gsf__nn_take_visited, &loader));
+}
+
+static void gsf__mini_close(gsf_context* ctx, gsf__mini* net) {
+    gsf_nn_destroy_weights(ctx, &net->weights);
+    memset(net, 0, sizeof *net);
+}
+
+// Opens a safetensors file or, if `data` is not NULL, its bytes, which the caller keeps; `path` then names them in errors.
+static gsf_result gsf__mini_open(gsf_context* ctx, const char* path, const void* data, size_t size, gsf__mini* net) {
+    memset(net, 0, sizeof *net);
+    gsf_result result = data ? gsf_nn_parse_weights(ctx, path ? path : "mini", data, size, &net->weights)
+                             : gsf_nn_load_weights(ctx, path, NULL, &net->weights);
+    if (!result) result = gsf__mini_bind(ctx, net);
+    if (result) gsf__mini_close(ctx, net);
+    return result;
+}
+
+// ---- mini: state of a pass
+
+typedef struct gsf__mini_planes { // of a level: (batch, height, width, channels) each
+    int64_t height, width;
+    float *x, *y;                             // results of the ways down and up; after use with their negative values cut off
+    float *a[GSF__MINI_BLOCKS + 1], *b[GSF__MINI_BLOCKS + 1]; // inputs of a block's convolutions; the last is `out`
+    float *dx, *dy, *da, *db;                 // training: gradients; da, db: of a block's intermediates
+} gsf__mini_planes;
+
+typedef struct gsf__mini_run {
+    gsf_context* ctx;
+    const gsf__mini* net;
+    const gsf__mini_input* inputs;            // (batch), all of the same size and number of references
+    int64_t batch, references;
+    int64_t height, width;                    // of the frames, extended
+    int training;                             // keep what the backward pass needs
+    gsf__nn_workspace workspace;
+    float *memory;
+    float *frame;                             // (batch, half height, half width, 4 planes + 2 features): the U-Net's input
+    float *shown;                             // (batch, references, half height, half width, 4 planes)
+    float *hidden, *features;                 // likewise
+    float *share;                             // (batch, half height, half width, references): of each in the mean
+    float *head, *common, *heads, *choices;   // common: head_frame's result; heads, choices: per reference
+    gsf__mini_planes levels[GSF__MINI_LEVELS];
+    float *weight;                            // (batch, height, width, candidates)
+    float *out, *error;                       // (batch, height, width, 3), not clamped; its logarithm (batch, height, width)
+    float *dframe, *dfeatures, *dhidden, *dhead, *dcommon, *dheads, *dchoices, *dout, *derror; // training: gradients
+    double* dattention;                       // training: per row, of the attention's weights and bias
+} gsf__mini_run;
+
+static int64_t gsf__mini_candidates(const gsf__mini_run* r) { return 2 + GSF__MINI_CHOICES * r->references; }
+
+static int64_t gsf__mini_extended(int64_t side) { return gsf__ceil_div(side, GSF__MINI_MULTIPLE) * GSF__MINI_MULTIPLE; }
+
+static void gsf__mini_lay_out_level(gsf__mini_run* r, int l, gsf__nn_arena* arena) {
+    gsf__mini_planes* p = &r->levels[l];
+    p->height = r->height / 2 >> l;
+    p->width = r->width / 2 >> l;
+    const size_t size = (size_t)(r->batch * p->height * p->width * r->net->width[l]);
+    p->x = gsf__nn_share(arena, size);
+    p->y = l + 1 < GSF__MINI_LEVELS ? gsf__nn_share(arena, size) : p->x;
+    for (int k = 0; k <= GSF__MINI_BLOCKS; k++) { // without training, all blocks use the same memory
+        p->a[k] = k && !r->training ? p->a[0] : gsf__nn_share(arena, size);
+        p->b[k] = k && !r->training ? p->b[0] : gsf__nn_share(arena, size);
+    }
+    if (!r->training) return;
+    p->dx = gsf__nn_share(arena, size);
+    p->dy = l + 1 < GSF__MINI_LEVELS ? gsf__nn_share(arena, size) : p->dx;
+    p->da = gsf__nn_share(arena, size);
+    p->db = gsf__nn_share(arena, size);
+}
+
+// Divides the memory of a pass; returns the floats needed.
+static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
+    const gsf__mini* net = r->net;
+    const size_t pixels = (size_t)(r->batch * r->height * r->width), coarse = pixels / 4, each = coarse * (size_t)r->references;
+    const size_t input = coarse * (size_t)(4 * GSF__MINI_FRAME + 2 * net->features), training = r->training != 0;
+    gsf__nn_arena arena = {memory, 0};
+    r->frame = gsf__nn_share(&arena, input);
+    r->shown = gsf__nn_share(&arena, each * 4 * GSF__MINI_REFERENCE);
+    r->hidden = gsf__nn_share(&arena, each * (size_t)net->hidden);
+    r->features = gsf__nn_share(&arena, each * (size_t)net->features);
+    r->share = gsf__nn_share(&arena, each);
+    r->head = gsf__nn_share(&arena, coarse * 4 * GSF__MINI_HEAD);
+    r->common = gsf__nn_share(&arena, coarse * (size_t)net->shared);
+    r->heads = gsf__nn_share(&arena, each * (size_t)net->shared);
+    r->choices = gsf__nn_share(&arena, each * 4 * GSF__MINI_CHOICES);
+    r->out = gsf__nn_share(&arena, 3 * pixels);
+    r->error = gsf__nn_share(&arena, pixels);
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) gsf__mini_lay_out_level(r, l, &arena);
+    r->weight = gsf__nn_share(&arena, training * pixels * (size_t)gsf__mini_candidates(r));
+    r->dframe = gsf__nn_share(&arena, training * input);
+    r->dfeatures = gsf__nn_share(&arena, training * each * (size_t)net->features);
+    r->dhidden = gsf__nn_share(&arena, training * each * (size_t)net->hidden);
+    r->dhead = gsf__nn_share(&arena, training * coarse * 4 * GSF__MINI_HEAD);
+    r->dcommon = gsf__nn_share(&arena, training * coarse * (size_t)net->shared);
+    r->dheads = gsf__nn_share(&arena, training * each * (size_t)net->shared);
+    r->dchoices = gsf__nn_share(&arena, training * each * 4 * GSF__MINI_CHOICES);
+    r->dout = gsf__nn_share(&arena, training * 3 * pixels);
+    r->derror = gsf__nn_share(&arena, training * pixels);
+    gsf__nn_share(&arena, arena.used % 2); // doubles follow
+    r->dattention = (double*)(void*)gsf__nn_share(
+        &arena, training * 2 * (size_t)(r->batch * r->height / 2) * (size_t)(net->features + 1));
+    return arena.used;
+}
+
+// Allocates a pass over a batch of inputs of this size, to be used for any number of them; end it in any case.
+static gsf_result gsf__mini_begin(gsf_context* ctx, const gsf__mini* net, int64_t batch, int64_t references, int64_t width,
+                                  int64_t height, int training, gsf__mini_run* r) {
+    memset(r, 0, sizeof *r);
+    if (batch < 1 || width < 1 || height < 1 || references < 0 || references > GSF__MINI_MOST || batch > 65536 ||
+        width > 65536 || height > 65536)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: invalid batch %lld of %lld x %lld pixels, %lld references",
+                        (long long)batch, (long long)width, (long long)height, (long long)references);
+    r->ctx = ctx;
+    r->net = net;
+    r->batch = batch;
+    r->references = references;
+    r->width = gsf__mini_extended(width);
+    r->height = gsf__mini_extended(height);
+    r->training = training;
+    r->memory = (float*)gsf_alloc(ctx, gsf__mini_lay_out(r, NULL), sizeof(float));
+    if (!r->memory) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__mini_lay_out(r, r->memory);
+    return GSF_OK;
+}
+
+static void gsf__mini_end(gsf__mini_run* r) {
+    if (!r->ctx) return;
+    gsf__nn_destroy_workspace(r->ctx, &r->workspace);
+    gsf_free(r->ctx, r->memory);
+    memset(r, 0, sizeof *r);
+}
+
+// ---- mini: steps of the forward pass
+
+// What the layers see of a reference in a pixel: differences from the render, so that a blend starts from the render, in
+// units that make them about as large as the other planes; 0 where the reference shows nothing.
+static void gsf__mini_describe(const float* frame, const float* p, float* out) {
+    const float seen = p[6] > 0.0f ? 1.0f : 0.0f, valid = p[12] > 0.0f ? 1.0f : 0.0f;
+    for (int c = 0; c < 3; c++) {
+        out[c] = 2.0f * seen * (p[c] - frame[c]);
+        out[3 + c] = 4.0f * seen * p[3 + c];
+        out[9 + c] = 2.0f * valid * (p[9 + c] - frame[c]);
+    }
+    out[6] = p[6];
+    out[7] = seen * p[7];
+    out[8] = seen * p[8];
+    out[12] = valid;
+    out[13] = valid * p[13];
+}
+
+// Candidate k of a reference is the render plus this factor times values gsf__mini_offset[k] ... of what the layers see.
+static const float gsf__mini_factor[GSF__MINI_CHOICES] = {0.5f, 0.25f, 0.5f};
+static const int gsf__mini_offset[GSF__MINI_CHOICES] = {0, 3, 9};
+
+// A row of half the frame's size: every 2 x 2 pixels become one of four times the planes.
+static void gsf__mini_assemble_row(void* arg, size_t index, int32_t worker) {
+    const gsf__mini_run* r = (const gsf__mini_run*)arg;
+    const int64_t h = r->height / 2, w = r->width / 2, b = (int64_t)index / h, y = (int64_t)index % h;
+    const gsf__mini_input* in = &r->inputs[b];
+    const int64_t pitch = 4 * GSF__MINI_FRAME + 2 * r->net->features;
+    (void)worker;
+    for (int64_t x = 0; x < 2 * w; x++)
+        for (int64_t i = 0; i < 2; i++) {
+            const int64_t part = 2 * i + x % 2, plane = in->height * in->width;
+            const int64_t from = gsf__least(2 * y + i, in->height - 1) * in->width + gsf__least(x, in->width - 1);
+            const float* frame = in->frame + from * GSF__MINI_FRAME;
+            float* to = r->frame + ((b * h + y) * w + x / 2) * pitch + part * GSF__MINI_FRAME;
+            memcpy(to, frame, GSF__MINI_FRAME * sizeof(float));
+            for (int c = 0; c < 3; c++) to[c] -= 0.5f;
+            for (int64_t k = 0; k < r->references; k++) {
+                const int64_t coarse = ((b * r->references + k) * h + y) * w + x / 2;
+                gsf__mini_describe(frame, in->shown + (k * plane + from) * GSF__MINI_REFERENCE,
+                                   r->shown + (coarse * 4 + part) * GSF__MINI_REFERENCE);
+            }
+        }
+}
+
+static gsf_result gsf__mini_convolve(gsf__mini_run* r, const gsf__nn_layer* layer, const float* x, int64_t frames, int level,
+                                     int halve, int accumulate, float* y) {
+    gsf__nn_conv_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.frames = frames;
+    d.height = r->levels[level].height; // of x
+    d.width = r->levels[level].width;
+    d.weight = layer->weight;
+    d.bias = layer->bias;
+    d.halve = halve;
+    d.accumulate = accumulate;
+    d.y = y;
+    return gsf__nn_convolve(r->ctx, &r->workspace, &d);
+}
+
+static void gsf__mini_relu(gsf__mini_run* r, float* x, int64_t count) {
+    gsf__nn_activate(r->ctx, GSF__NN_RELU, x, count, x);
+}
+
+// Whether the reference shows anything in a coarse pixel.
+static int gsf__mini_shows(const float* shown) {
+    for (int part = 0; part < 4; part++, shown += GSF__MINI_REFERENCE)
+        if (shown[6] > 0.0f || shown[12] > 0.0f) return 1;
+    return 0;
+}
+
+// Joins the features of a pixel's references to the U-Net's input: 2 * their mean, weighted by a softmax of their attention
+// and of a 0 that stands for the render, and their maximum.
+static void gsf__mini_join_row(void* arg, size_t index, int32_t worker) {
+    const gsf__mini_run* r = (const gsf__mini_run*)arg;
+    const int64_t w = r->width / 2, rows = r->height / 2, b = (int64_t)index / rows, e = r->net->features, n = r->references;
+    const int64_t pitch = 4 * GSF__MINI_FRAME + 2 * e, plane = rows * w;
+    float attention[GSF__MINI_CHANNELS], bias;
+    (void)worker;
+    gsf_nn_convert_tensor(r->net->attention.weight, 0, e, attention);
+    gsf_nn_convert_tensor(r->net->attention.bias, 0, 1, &bias);
+    for (int64_t x = 0; x < w; x++) {
+        const int64_t at = (int64_t)index * w + x, first = b * n * plane + at % plane;
+        float *mean = r->frame + at * pitch + 4 * GSF__MINI_FRAME, *most = mean + e, *share = r->share + at * n;
+        float top = 0.0f, sum;
+        memset(mean, 0, (size_t)(2 * e) * sizeof(float));
+        for (int64_t k = 0; k < n; k++) {
+            float *f = r->features + (first + k * plane) * e, dot = bias;
+            if (!gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE)) {
+                memset(f, 0, (size_t)e * sizeof(float));
+                share[k] = -FLT_MAX;
+                continue;
+            }
+            for (int64_t i = 0; i < e; i++) dot += attention[i] * f[i];
+            share[k] = dot;
+            if (dot > top) top = dot;
+        }
+        sum = expf(-top);
+        for (int64_t k = 0; k < n; k++) sum += share[k] = share[k] > -FLT_MAX ? expf(share[k] - top) : 0.0f;
+        for (int64_t k = 0; k < n; k++) {
+            const float* f = r->features + (first + k * plane) * e;
+            share[k] /= sum;
+            for (int64_t i = 0; i < e; i++) {
+                mean[i] += 2.0f * share[k] * f[i];
+                if (f[i] > most[i]) most[i] = f[i];
+            }
+        }
+    }
+}
+
+typedef struct gsf__mini_scale_job { // between a level and the one below
+    const float* from;
+    float* to;
+    int64_t height, width, channels; // of the coarser level; all frames of a batch one below the other
+} gsf__mini_scale_job;
+
+static void gsf__mini_upscale_row(void* arg, size_t row, int32_t worker) { // to += from, upscaled by repetition
+    const gsf__mini_scale_job* job = (const gsf__mini_scale_job*)arg;
+    const int64_t c = job->channels, w = 2 * job->width;
+    float* to = job->to + (int64_t)row * w * c;
+    const float* from = job->from + (int64_t)row / 2 * job->width * c;
+    (void)worker;
+    for (int64_t x = 0; x < w; x++)
+        for (int64_t i = 0; i < c; i++) to[x * c + i] += from[x / 2 * c + i];
+}
+
+static gsf_result gsf__mini_run_block(gsf__mini_run* r, const gsf__mini_block* block, int level, int k, float* x) {
+    const gsf__mini_planes* p = &r->levels[level];
+    const int64_t count = r->batch * p->height * p->width * r->net->width[level];
+    gsf__nn_activate(r->ctx, GSF__NN_RELU, x, count, p->a[k]);
+    GSF__TRY(gsf__mini_convolve(r, &block->first, p->a[k], r->batch, level, 0, 0, p->b[k]));
+    gsf__mini_relu(r, p->b[k], count);
+    return gsf__mini_convolve(r, &block->second, p->b[k], r->batch, level, 0, 1, x);
+}
+
+static gsf_result gsf__mini_run_levels(gsf__mini_run* r) {
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) { // down
+        const gsf__mini_level* net = &r->net->levels[l];
+        const gsf__mini_planes* p = &r->levels[l];
+        GSF__TRY(gsf__mini_convolve(r, &net->down, l ? p[-1].x : r->frame, r->batch, l ? l - 1 : 0, l > 0, 0, p->x));
+        for (int k = 0; k < r->net->blocks[l]; k++) GSF__TRY(gsf__mini_run_block(r, &net->in[k], l, k, p->x));
+        gsf__mini_relu(r, p->x, r->batch * p->height * p->width * r->net->width[l]);
+        GSF__TRY(gsf__check_cancel(r->ctx));
+    }
+    for (int l = GSF__MINI_LEVELS - 2; l >= 0; l--) { // up; a 1x1 convolution may as well come before the upscaling
+        const gsf__mini_level* net = &r->net->levels[l];
+        const gsf__mini_planes *p = &r->levels[l], *below = p + 1;
+        float* small = p->a[GSF__MINI_BLOCKS]; // free until the block
+        GSF__TRY(gsf__mini_convolve(r, &net->skip, p->x, r->batch, l, 0, 0, p->y));
+        GSF__TRY(gsf__mini_convolve(r, &net->below, below->y, r->batch, l + 1, 0, 0, small));
+        gsf__mini_scale_job job = {small, p->y, below->height, below->width, r->net->width[l]};
+        gsf__parallel_for(r->ctx, (size_t)(r->batch * p->height), gsf__mini_upscale_row, &job);
+        GSF__TRY(gsf__mini_run_block(r, &net->out, l, GSF__MINI_BLOCKS, p->y));
+        gsf__mini_relu(r, p->y, r->batch * p->height * p->width * r->net->width[l]);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__mini_run_heads(gsf__mini_run* r) {
+    const gsf__mini* net = r->net;
+    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width;
+    const int64_t size = plane * net->shared;
+    GSF__TRY(gsf__mini_convolve(r, &net->head, r->levels[0].y, r->batch, 0, 0, 0, r->head));
+    if (!frames) return GSF_OK;
+    GSF__TRY(gsf__mini_convolve(r, &net->head_frame, r->levels[0].y, r->batch, 0, 0, 0, r->common));
+    for (int64_t i = 0; i < frames; i++)
+        memcpy(r->heads + i * size, r->common + i / r->references * size, (size_t)size * sizeof(float));
+    GSF__TRY(gsf__mini_convolve(r, &net->head_reference, r->features, frames, 0, 0, 1, r->heads));
+    gsf__mini_relu(r, r->heads, frames * size);
+    return gsf__mini_convolve(r, &net->head_blend, r->heads, frames, 0, 0, 0, r->choices);
+}
+
+typedef struct gsf__mini_pixel { // of a frame, where its values are
+    int64_t coarse, fine;        // indices of the pixel of half the size, and of the pixel
+    const float *frame, *head;
+    int64_t shown, choices, next_shown, next_choices; // of the first reference; from one reference to the next
+} gsf__mini_pixel;
+
+static gsf__mini_pixel gsf__mini_pixel_at(const gsf__mini_run* r, int64_t row, int64_t x) { // row: of all frames
+    const int64_t h = r->height / 2, w = r->width / 2, b = row / r->height, part = 2 * (row % 2) + x % 2, plane = h * w;
+    gsf__mini_pixel p;
+    p.coarse = (row / 2) * w + x / 2;
+    p.fine = row * r->width + x;
+    p.frame = r->frame + p.coarse * (4 * GSF__MINI_FRAME + 2 * r->net->features) + part * GSF__MINI_FRAME;
+    p.head = r->head + (p.coarse * 4 + part) * GSF__MINI_HEAD;
+    const int64_t first = b * r->references * plane + p.coarse - b * plane; // of the planes of the frame's references
+    p.shown = (first * 4 + part) * GSF__MINI_REFERENCE;
+    p.choices = (first * 4 + part) * GSF__MINI_CHOICES;
+    p.next_shown = plane * 4 * GSF__MINI_REFERENCE;
+    p.next_choices = plane * 4 * GSF__MINI_CHOICES;
+    return p;
+}
+
+static const float gsf__mini_free = 0.5f;   // factor of the free colour
+static const float gsf__mini_least = -6.0f; // of the error's logarithm
+
+static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
+    const gsf__mini_run* r = (const gsf__mini_run*)arg;
+    const int64_t n = gsf__mini_candidates(r);
+    const gsf__activation_kernels* kernels = gsf__activation_kernels_of(r->ctx->cpu_level);
+    float logits[2 + GSF__MINI_CHOICES * GSF__MINI_MOST];
+    (void)worker;
+    for (int64_t x = 0; x < r->width; x++) {
+        const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
+        float *out = r->out + 3 * p.fine, *weight = r->training ? r->weight + p.fine * n : logits;
+        logits[0] = p.head[0];
+        logits[1] = p.head[1];
+        for (int64_t k = 0; k < r->references; k++) {
+            const float *shown = r->shown + p.shown + k * p.next_shown, *choices = r->choices + p.choices + k * p.next_choices;
+            float* to = logits + 2 + GSF__MINI_CHOICES * k;
+            to[0] = shown[6] > 0.0f ? choices[0] : -1e30f;
+            to[1] = shown[6] > 0.0f ? choices[1] : -1e30f;
+            to[2] = shown[12] > 0.0f ? choices[2] : -1e30f;
+        }
+        kernels->softmax(logits, n, 1.0f, weight);
+        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + weight[1] * gsf__mini_free * p.head[2 + c];
+        for (int64_t k = 0; k < r->references; k++)
+            for (int i = 0; i < GSF__MINI_CHOICES; i++) {
+                const float by = weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
+                const float* d = r->shown + p.shown + k * p.next_shown + gsf__mini_offset[i];
+                for (int c = 0; c < 3; c++) out[c] += by * d[c];
+            }
+        const float error = p.head[5];
+        r->error[p.fine] = error > 0.0f ? 0.0f : error > gsf__mini_least ? error : gsf__mini_least;
+    }
+}
+
+// Computes r->out and r->error of a batch.
+GSF__SHARED gsf_result gsf__mini_forward(gsf__mini_run* r, const gsf__mini_input* inputs) {
+    const gsf__mini* net = r->net;
+    const int64_t frames = r->batch * r->references, coarse = r->levels[0].height * r->levels[0].width;
+    const size_t rows = (size_t)(r->batch * r->levels[0].height);
+    r->inputs = inputs;
+    gsf__parallel_for(r->ctx, rows, gsf__mini_assemble_row, r);
+    if (frames) {
+        GSF__TRY(gsf__mini_convolve(r, &net->first, r->shown, frames, 0, 0, 0, r->hidden));
+        gsf__mini_relu(r, r->hidden, frames * coarse * net->hidden);
+        GSF__TRY(gsf__mini_convolve(r, &net->second, r->hidden, frames, 0, 0, 0, r->features));
+        gsf__mini_relu(r, r->features, frames * coarse * net->features);
+    }
+    gsf__parallel_for(r->ctx, rows, gsf__mini_join_row, r);
+    GSF__TRY(gsf__mini_run_levels(r));
+    GSF__TRY(gsf__mini_run_heads(r));
+    gsf__parallel_for(r->ctx, (size_t)(r->batch * r->height), gsf__mini_blend_row, r);
+    return GSF_OK;
+}
+
+// ---- mini: the restorer
+
+typedef struct gsf__mini_restorer {
+    gsf_nn_mini_desc desc;  // with its defaults filled in; the file is not needed any more
+    gsf__mini net;
+    gsf__mini_run run;      // of one frame; made when the first one comes
+    float* planes;          // of one frame, then of its references
+    size_t plane_count;
+    int begun;
+} gsf__mini_restorer;
+
+static float gsf__mini_clamp(float x, float low, float high) { return x >= high ? high : x > low ? x : low; } // NaN: low
+
+// Four times the logarithm of a ratio of depths, within [-1,1]; `none` if there is no such ratio.
+static float gsf__mini_ratio(float a, float b, float none) {
+    return a > 0.0f && b > 0.0f ? gsf__mini_clamp(4.0f * logf(a / b), -1.0f, 1.0f) : none;
+}
+
+static const float* gsf__mini_row(const gsf_image* image, int64_t y) {
+    return (const float*)(const void*)((const char*)image->data + y * image->stride_y);
+}
+
+// Whether pixels are `channels` floats one after another, as those that the loop and gsf_restore_clip make.
+static int gsf__mini_is_packed(const gsf_image* image, int64_t width, int64_t height, int32_t channels) {
+    return image->data && image->dtype == GSF_F32 && image->channels == channels && image->width == width &&
+           image->height == height && image->stride_x == channels * (int64_t)sizeof(float) &&
+           (channels == 1 || image->stride_c == (int64_t)sizeof(float)) && image->stride_y % (int64_t)sizeof(float) == 0;
+}
+
+// The planes of a frame, see gsf__mini_input.
+GSF__SHARED void gsf__mini_plane_frame(const gsf_image* color, const gsf_image* alpha, const gsf_image* depth, float* out) {
+    const int64_t w = color->width, h = color->height;
+    double sum = 0.0, count = 0.0;
+    for (int64_t y = 0; y < h; y++)
+        for (int64_t x = 0; x < w; x++) {
+            const float z = gsf__mini_row(depth, y)[x];
+            if (!(z > 0.0f)) continue;
+            sum += 1.0 / (double)z;
+            count += 1.0;
+        }
+    const float unit = sum > 0.0 ? (float)(0.25 * count / sum) : 0.0f;
+    for (int64_t y = 0; y < h; y++)
+        for (int64_t x = 0; x < w; x++, out += GSF__MINI_FRAME) {
+            const float z = gsf__mini_row(depth, y)[x];
+            for (int c = 0; c < 3; c++) out[c] = gsf__mini_clamp(gsf__mini_row(color, y)[3 * x + c], 0.0f, 1.0f);
+            out[3] = gsf__mini_clamp(gsf__mini_row(alpha, y)[x], 0.0f, 1.0f);
+            out[4] = z > 0.0f ? gsf__mini_clamp(unit / z, 0.0f, 1.0f) : 0.0f;
+        }
+}
+
+// Those of what a reference shows in it; depth: the frame's.
+GSF__SHARED void gsf__mini_plane_reference(const gsf_carried* c, const gsf_image* depth, float* out) {
+    for (int64_t y = 0; y < depth->height; y++)
+        for (int64_t x = 0; x < depth->width; x++, out += GSF__MINI_REFERENCE) {
+            const float score = gsf__mini_row(&c->score, y)[x], ratio = gsf__mini_row(&c->back_ratio, y)[x];
+            const float angle = gsf__mini_row(&c->angle, y)[x];
+            memset(out, 0, GSF__MINI_REFERENCE * sizeof(float));
+            if (score > 0.0f) {
+                for (int i = 0; i < 3; i++) {
+                    out[i] = gsf__mini_clamp(gsf__mini_row(&c->color, y)[3 * x + i], 0.0f, 1.0f);
+                    out[3 + i] = gsf__mini_clamp(gsf__mini_row(&c->residual, y)[3 * x + i], -1.0f, 1.0f);
+                }
+                out[6] = gsf__mini_clamp(0.2f + 0.8f * score, 0.0f, 1.0f);
+                out[7] = gsf__mini_ratio(gsf__mini_row(&c->depth, y)[x], gsf__mini_row(depth, y)[x], -1.0f);
+                out[8] = expf(-12.5f * angle * angle);
+            }
+            if (ratio > 0.0f) {
+                const float* color = gsf__mini_row(&c->back_color, y) + 3 * x;
+                for (int i = 0; i < 3; i++) out[9 + i] = gsf__mini_clamp(color[i], 0.0f, 1.0f);
+                out[12] = 1.0f;
+                out[13] = gsf__mini_ratio(ratio, 1.0f, 0.0f);
+            }
+        }
+}
+
+static gsf_result gsf__mini_check_carried(gsf_context* ctx, const gsf_carried* c, int64_t width, int64_t height) {
+    if (c->reference < 0 || (gsf__mini_is_packed(&c->color, width, height, 3) &&
+                             gsf__mini_is_packed(&c->residual, width, height, 3) &&
+                             gsf__mini_is_packed(&c->score, width, height, 1) &&
+                             gsf__mini_is_packed(&c->depth, width, height, 1) &&
+                             gsf__mini_is_packed(&c->angle, width, height, 1) &&
+                             gsf__mini_is_packed(&c->back_color, width, height, 3) &&
+                             gsf__mini_is_packed(&c->back_ratio, width, height, 1)))
+        return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: a carried photo is not f32 of the frame's size");
+}
+
+static gsf_result gsf__mini_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
+                                  gsf_restorer_info* out) {
+    const gsf__mini_restorer* r = (const gsf__mini_restorer*)user;
+    gsf__mini_run run;
+    (void)ctx;
+    out->needs_depth = out->needs_alpha = 1;
+    if (out->struct_size < sizeof *out) return GSF_OK;
+    out->needs_carried = r->desc.references;
+    memset(&run, 0, sizeof run);
+    run.net = &r->net;
+    run.batch = 1;
+    run.references = r->desc.references;
+    run.width = gsf__mini_extended(width);
+    run.height = gsf__mini_extended(height);
+    const double pixels = (double)run.width * (double)run.height, e = (double)r->net.features;
+    const double seen = (double)(4 * (int64_t)GSF__MINI_REFERENCE), frame = (double)(4 * (int64_t)GSF__MINI_FRAME);
+    double products = (double)r->net.hidden * (seen + 9.0 * e) + (double)r->net.shared * (9.0 * e + 12.0);
+    products = products * r->desc.references + 9.0 * (double)(r->net.width[0] * r->net.shared);
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) {
+        const double w = (double)r->net.width[l], above = l ? (double)r->net.width[l - 1] : frame + 2.0 * e;
+        const double blocks = r->net.blocks[l] + (l + 1 < GSF__MINI_LEVELS);
+        products += (9.0 * w * above + 18.0 * w * w * blocks + w * w) / (double)(1 << 2 * l);
+    }
+    out->flops = frame_count * 0.5 * pixels * products;
+    const int64_t planes = GSF__MINI_FRAME + GSF__MINI_REFERENCE * (int64_t)r->desc.references;
+    out->bytes = 4.0 * (double)gsf__mini_lay_out(&run, NULL) + 4.0 * pixels * (double)planes;
+    return GSF_OK;
+}
+
+static gsf_result gsf__mini_begin_photos(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    gsf__mini_restorer* r = (gsf__mini_restorer*)user;
+    (void)references; // they come carried
+    (void)count;
+    if (r->begun) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: begun twice");
+    r->begun = 1;
+    return GSF_OK;
+}
+
+static void gsf__mini_end_photos(void* user, gsf_context* ctx) {
+    gsf__mini_restorer* r = (gsf__mini_restorer*)user;
+    gsf__mini_end(&r->run);
+    gsf_free(ctx, r->planes);
+    r->planes = NULL;
+    r->plane_count = 0;
+    r->begun = 0;
+}
+
+// Makes the pass and the planes for frames of this size.
+static gsf_result gsf__mini_fit(gsf_context* ctx, gsf__mini_restorer* r, int64_t width, int64_t height) {
+    const size_t pixels = (size_t)(width * height), each = GSF__MINI_FRAME + GSF__MINI_REFERENCE * (size_t)r->desc.references;
+    if (r->run.width != gsf__mini_extended(width) || r->run.height != gsf__mini_extended(height)) {
+        gsf__mini_end(&r->run);
+        GSF__TRY(gsf__mini_begin(ctx, &r->net, 1, r->desc.references, width, height, 0, &r->run));
+    }
+    if (r->plane_count >= pixels * each) return GSF_OK;
+    gsf_free(ctx, r->planes);
+    r->plane_count = 0;
+    r->planes = (float*)gsf_alloc(ctx, pixels * each, sizeof(float));
+    if (!r->planes) return GSF_ERROR_OUT_OF_MEMORY;
+    r->plane_count = pixels * each;
+    return GSF_OK;
+}
+
+// Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b.
+static void gsf__mini_write(const gsf__mini_restorer* r, const gsf_image* color, const gsf_image* confidence) {
+    const float square = r->desc.sigma * r->desc.sigma;
+    for (int64_t y = 0; y < color->height; y++) {
+        const float *out = r->run.out + 3 * y * r->run.width, *error = r->run.error + y * r->run.width;
+        char *to = (char*)color->data + y * color->stride_y, *weight = (char*)confidence->data + y * confidence->stride_y;
+        for (int64_t x = 0; x < color->width; x++) {
+            for (int64_t c = 0; c < 3; c++)
+                *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) = gsf__mini_clamp(out[3 * x + c], 0.0f, 1.0f);
+            *(float*)(void*)(weight + x * confidence->stride_x) = square / (square + expf(2.0f * error[x]));
+        }
+    }
+}
+
+static gsf_result gsf__mini_restore_frame(gsf_context* ctx, gsf__mini_restorer* r, const gsf_restore_window* window,
+                                          gsf__carry_fn carry, int32_t frame) {
+    const gsf_image *color = window->color + frame, *depth = window->depth + frame, *alpha = window->alpha + frame;
+    const int64_t w = color->width, h = color->height, pixels = w * h;
+    gsf__mini_input input;
+    if (!gsf__mini_is_packed(color, w, h, 3) || !gsf__mini_is_packed(depth, w, h, 1) || !gsf__mini_is_packed(alpha, w, h, 1) ||
+        window->out_color[frame].width != w || window->out_color[frame].height != h ||
+        window->out_confidence[frame].width != w || window->out_confidence[frame].height != h)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: frame %d lacks an f32 image of its size", (int)frame);
+    GSF__TRY(gsf__mini_fit(ctx, r, w, h));
+    float* shown = r->planes + pixels * GSF__MINI_FRAME;
+    gsf__mini_plane_frame(color, alpha, depth, r->planes);
+    for (int32_t k = 0; k < r->desc.references; k++) {
+        gsf_carried carried;
+        memset(&carried, 0, sizeof carried);
+        GSF__TRY(carry(window->carry_user, ctx, frame, k, &carried));
+        GSF__TRY(gsf__mini_check_carried(ctx, &carried, w, h));
+        float* to = shown + k * pixels * GSF__MINI_REFERENCE;
+        if (carried.reference < 0) memset(to, 0, (size_t)(pixels * GSF__MINI_REFERENCE) * sizeof(float));
+        else gsf__mini_plane_reference(&carried, depth, to);
+    }
+    memset(&input, 0, sizeof input);
+    input.width = w;
+    input.height = h;
+    input.references = r->desc.references;
+    input.frame = r->planes;
+    input.shown = shown;
+    GSF__TRY(gsf__mini_forward(&r->run, &input));
+    GSF__TRY(gsf__nn_check_finite(ctx, &r->net.weights, "mini", "", "the network", r->run.out,
+                                  3 * r->run.width * r->run.height));
+    gsf__mini_write(r, window->out_color + frame, window->out_confidence + frame);
+    return GSF_OK;
+}
+
+static gsf_result gsf__mini_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    gsf__mini_restorer* r = (gsf__mini_restorer*)user;
+    const gsf__carry_fn carry = gsf__carry_fn_of(window);
+    if (!carry || !window->depth || !window->alpha)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "mini: the clip comes without %s",
+                        carry ? "depth and opacity" : "photos carried into its frames");
+    for (int32_t frame = 0; frame < window->frame_count; frame++) {
+        GSF__TRY(gsf__check_cancel(ctx));
+        GSF__TRY(gsf__mini_restore_frame(ctx, r, window, carry, frame));
+    }
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_mini(gsf_context* ctx, gsf_restorer* restorer) {
+    gsf__mini_restorer* r = (gsf__mini_restorer*)restorer->user;
+    memset(restorer, 0, sizeof *restorer);
+    if (!r) return;
+    gsf__mini_end_photos(r, ctx);
+    gsf__mini_close(ctx, &r->net);
+    gsf_free(ctx, r);
+}
+
+GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* desc, gsf_restorer* out) {
+    memset(out, 0, sizeof *out);
+    if (!desc || (!desc->path && !desc->data))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: no weights given");
+    if (desc->references < 0 || desc->references > GSF__MINI_MOST || !(desc->sigma >= 0.0f && desc->sigma <= 1e6f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: invalid %d references or sigma %g", (int)desc->references,
+                        (double)desc->sigma);
+    gsf__mini_restorer* r = (gsf__mini_restorer*)gsf_alloc_zeroed(ctx, 1, sizeof *r);
+    if (!r) return GSF_ERROR_OUT_OF_MEMORY;
+    r->desc = *desc;
+    if (r->desc.references == 0) r->desc.references = 3;
+    if (r->desc.sigma == 0.0f) r->desc.sigma = 0.05f;
+    out->struct_size = sizeof *out;
+    out->name = "mini";
+    out->user = r;
+    out->query_fn = gsf__mini_query;
+    out->begin_fn = gsf__mini_begin_photos;
+    out->restore_fn = gsf__mini_restore;
+    out->end_fn = gsf__mini_end_photos;
+    const gsf_result result = gsf__mini_open(ctx, desc->path, desc->data, desc->size, &r->net);
+    if (result) gsf_nn_destroy_mini(ctx, out);
+    return result;
+}
+
 // ---- >>nn metrics ---------------------------------------------------------------
 // Networks that compare images, channels-last as in >>nn convolution. Every score is summed in double.
 
@@ -18747,6 +19510,380 @@ GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_
         gsf__nn_destroy_workspace(ctx, &t.run.nn.workspace);
         gsf_free(ctx, memory);
     }
+    return result;
+}
+
+// ---- training: mini
+
+/* Gradients of gsf__mini_forward; names: d* is the gradient of *. A way down's result x and a way up's result y have been cut
+   off at zero when they are used, so that their own signs tell where the cut was. */
+
+static gsf_result gsf__mini_convolve_grad(gsf__mini_run* r, gsf__nn_params* params, const gsf__nn_layer* layer, const float* x,
+                                          int64_t frames, int level, int halve, const float* dy, int accumulate, float* dx) {
+    gsf__nn_conv_desc forward;
+    gsf__nn_conv_grad_desc d;
+    memset(&forward, 0, sizeof forward);
+    memset(&d, 0, sizeof d);
+    forward.x = x;
+    forward.frames = frames;
+    forward.height = r->levels[level].height;
+    forward.width = r->levels[level].width;
+    forward.weight = layer->weight;
+    forward.halve = halve;
+    d.forward = &forward;
+    d.dy = dy;
+    d.dx = dx;
+    d.accumulate = accumulate;
+    d.dweight = gsf__nn_grad_of(params, layer->weight);
+    d.dbias = gsf__nn_grad_of(params, layer->bias);
+    return gsf__nn_conv_grad(r->ctx, &d);
+}
+
+static void gsf__mini_relu_grad(gsf__mini_run* r, const float* x, int64_t count, float* dx) { // dx: 0 where x is not positive
+    gsf__nn_activate_grad(r->ctx, GSF__NN_RELU, x, dx, count, dx);
+}
+
+typedef struct gsf__mini_add_job { // to += from where x is positive
+    const float *x, *from;
+    float* to;
+    int64_t count;
+} gsf__mini_add_job;
+
+static void gsf__mini_add_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__mini_add_job* job = (const gsf__mini_add_job*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
+    (void)worker;
+    for (int64_t i = begin; i < end; i++) job->to[i] += job->x[i] > 0.0f ? job->from[i] : 0.0f;
+}
+
+// dx: the gradient of the block's result, then of its input
+static gsf_result gsf__mini_block_grad(gsf__mini_run* r, gsf__nn_params* params, const gsf__mini_block* block, int level, int k,
+                                       float* dx) {
+    const gsf__mini_planes* p = &r->levels[level];
+    const int64_t count = r->batch * p->height * p->width * r->net->width[level];
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &block->second, p->b[k], r->batch, level, 0, dx, 0, p->db));
+    gsf__mini_relu_grad(r, p->b[k], count, p->db);
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &block->first, p->a[k], r->batch, level, 0, p->db, 0, p->da));
+    gsf__mini_add_job job = {p->a[k], p->da, dx, count};
+    gsf__parallel_for(r->ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__mini_add_chunk, &job);
+    return GSF_OK;
+}
+
+static void gsf__mini_upscale_grad_row(void* arg, size_t row, int32_t worker) { // to = sums of 2 x 2 pixels of from
+    const gsf__mini_scale_job* job = (const gsf__mini_scale_job*)arg;
+    const int64_t c = job->channels, pitch = 2 * job->width * c;
+    const float *from = job->from + 2 * (int64_t)row * pitch, *next = from + pitch;
+    float* to = job->to + (int64_t)row * job->width * c;
+    (void)worker;
+    for (int64_t x = 0; x < job->width; x++)
+        for (int64_t i = 0; i < c; i++) {
+            const int64_t at = 2 * x * c + i;
+            to[x * c + i] = (from[at] + from[at + c]) + (next[at] + next[at + c]);
+        }
+}
+
+// From levels[0].dy to dframe.
+static gsf_result gsf__mini_levels_grad(gsf__mini_run* r, gsf__nn_params* params) {
+    for (int l = 0; l + 1 < GSF__MINI_LEVELS; l++) {
+        const gsf__mini_level* net = &r->net->levels[l];
+        const gsf__mini_planes *p = &r->levels[l], *below = p + 1;
+        gsf__mini_relu_grad(r, p->y, r->batch * p->height * p->width * r->net->width[l], p->dy);
+        GSF__TRY(gsf__mini_block_grad(r, params, &net->out, l, GSF__MINI_BLOCKS, p->dy));
+        GSF__TRY(gsf__mini_convolve_grad(r, params, &net->skip, p->x, r->batch, l, 0, p->dy, 0, p->dx));
+        gsf__mini_scale_job job = {p->dy, p->da, below->height, below->width, r->net->width[l]};
+        gsf__parallel_for(r->ctx, (size_t)(r->batch * below->height), gsf__mini_upscale_grad_row, &job);
+        GSF__TRY(gsf__mini_convolve_grad(r, params, &net->below, below->y, r->batch, l + 1, 0, p->da, 0, below->dy));
+    }
+    for (int l = GSF__MINI_LEVELS - 1; l >= 0; l--) {
+        const gsf__mini_level* net = &r->net->levels[l];
+        const gsf__mini_planes* p = &r->levels[l];
+        gsf__mini_relu_grad(r, p->x, r->batch * p->height * p->width * r->net->width[l], p->dx);
+        for (int k = r->net->blocks[l] - 1; k >= 0; k--) GSF__TRY(gsf__mini_block_grad(r, params, &net->in[k], l, k, p->dx));
+        GSF__TRY(gsf__mini_convolve_grad(r, params, &net->down, l ? p[-1].x : r->frame, r->batch, l ? l - 1 : 0, l > 0, p->dx,
+                                         l > 0, l ? p[-1].dx : r->dframe));
+    }
+    return GSF_OK;
+}
+
+// From dout and derror, the gradients of out and error, to those of head and choices.
+static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
+    const gsf__mini_run* r = (const gsf__mini_run*)arg;
+    const int64_t n = gsf__mini_candidates(r);
+    float slope[2 + GSF__MINI_CHOICES * GSF__MINI_MOST];
+    (void)worker;
+    for (int64_t x = 0; x < r->width; x++) {
+        const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
+        const float *dout = r->dout + 3 * p.fine, *weight = r->weight + p.fine * n;
+        float *dhead = r->dhead + (p.head - r->head), mean = 0.0f;
+        memset(slope, 0, sizeof slope);
+        for (int c = 0; c < 3; c++) {
+            slope[1] += dout[c] * gsf__mini_free * p.head[2 + c];
+            dhead[2 + c] = weight[1] * gsf__mini_free * dout[c];
+        }
+        for (int64_t k = 0; k < r->references; k++)
+            for (int i = 0; i < GSF__MINI_CHOICES; i++) {
+                const float* d = r->shown + p.shown + k * p.next_shown + gsf__mini_offset[i];
+                slope[2 + GSF__MINI_CHOICES * k + i] = gsf__mini_factor[i] * (dout[0] * d[0] + dout[1] * d[1] + dout[2] * d[2]);
+            }
+        for (int64_t k = 0; k < n; k++) mean += weight[k] * slope[k];
+        dhead[0] = weight[0] * (slope[0] - mean);
+        dhead[1] = weight[1] * (slope[1] - mean);
+        dhead[5] = p.head[5] > gsf__mini_least && p.head[5] <= 0.0f ? r->derror[p.fine] : 0.0f;
+        for (int64_t k = 0; k < r->references; k++)
+            for (int i = 0; i < GSF__MINI_CHOICES; i++) { // a candidate that there is not has no weight
+                const int64_t at = 2 + GSF__MINI_CHOICES * k + i;
+                r->dchoices[p.choices + k * p.next_choices + i] = weight[at] * (slope[at] - mean);
+            }
+    }
+}
+
+static gsf_result gsf__mini_heads_grad(gsf__mini_run* r, gsf__nn_params* params) { // to levels[0].dy and dfeatures
+    const gsf__mini* net = r->net;
+    const int64_t frames = r->batch * r->references, plane = r->levels[0].height * r->levels[0].width;
+    const int64_t size = plane * net->shared;
+    float* dy = r->levels[0].dy;
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &net->head, r->levels[0].y, r->batch, 0, 0, r->dhead, 0, dy));
+    if (!frames) return GSF_OK;
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &net->head_blend, r->heads, frames, 0, 0, r->dchoices, 0, r->dheads));
+    gsf__mini_relu_grad(r, r->heads, frames * size, r->dheads);
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &net->head_reference, r->features, frames, 0, 0, r->dheads, 0, r->dfeatures));
+    for (int64_t b = 0; b < r->batch; b++)
+        for (int64_t k = 0; k < r->references; k++) {
+            const float* from = r->dheads + (b * r->references + k) * size;
+            float* to = r->dcommon + b * size;
+            for (int64_t i = 0; i < size; i++) to[i] = k ? to[i] + from[i] : from[i];
+        }
+    return gsf__mini_convolve_grad(r, params, &net->head_frame, r->levels[0].y, r->batch, 0, 0, r->dcommon, 1, dy);
+}
+
+// Adds to dfeatures what comes through the mean and the maximum.
+static void gsf__mini_join_grad_row(void* arg, size_t index, int32_t worker) {
+    const gsf__mini_run* r = (const gsf__mini_run*)arg;
+    const int64_t w = r->width / 2, rows = r->height / 2, b = (int64_t)index / rows, e = r->net->features, n = r->references;
+    const int64_t pitch = 4 * GSF__MINI_FRAME + 2 * e, plane = rows * w;
+    double* dattention = r->dattention + (int64_t)index * (e + 1);
+    float attention[GSF__MINI_CHANNELS], slope[GSF__MINI_MOST];
+    (void)worker;
+    gsf_nn_convert_tensor(r->net->attention.weight, 0, e, attention);
+    memset(dattention, 0, (size_t)(e + 1) * sizeof(double));
+    for (int64_t x = 0; x < w; x++) {
+        const int64_t at = (int64_t)index * w + x, first = b * n * plane + at % plane;
+        const float *dmean = r->dframe + at * pitch + 4 * GSF__MINI_FRAME, *dmost = dmean + e, *share = r->share + at * n;
+        const float* most = r->frame + at * pitch + 4 * GSF__MINI_FRAME + e;
+        float total = 0.0f;
+        for (int64_t k = 0; k < n; k++) {
+            const float* f = r->features + (first + k * plane) * e;
+            slope[k] = 0.0f;
+            for (int64_t i = 0; i < e; i++) slope[k] += 2.0f * dmean[i] * f[i];
+            total += share[k] * slope[k];
+        }
+        for (int64_t k = 0; k < n; k++) {
+            const float *f = r->features + (first + k * plane) * e, dlogit = share[k] * (slope[k] - total);
+            float* df = r->dfeatures + (first + k * plane) * e;
+            for (int64_t i = 0; i < e; i++) {
+                df[i] += 2.0f * share[k] * dmean[i] + dlogit * attention[i];
+                dattention[i] += (double)(dlogit * f[i]);
+            }
+            dattention[e] += (double)dlogit;
+        }
+        for (int64_t i = 0; i < e; i++) // of equal ones the first is the maximum; at 0 the slope is cut off anyway
+            for (int64_t k = 0; k < n; k++) {
+                const int64_t to = (first + k * plane) * e + i;
+                if (r->features[to] < most[i]) continue;
+                r->dfeatures[to] += dmost[i];
+                break;
+            }
+    }
+}
+
+static gsf_result gsf__mini_references_grad(gsf__mini_run* r, gsf__nn_params* params) {
+    const gsf__mini* net = r->net;
+    const int64_t frames = r->batch * r->references, coarse = r->levels[0].height * r->levels[0].width, e = net->features;
+    const int64_t rows = r->batch * r->levels[0].height;
+    float *dweight = gsf__nn_grad_of(params, net->attention.weight), *dbias = gsf__nn_grad_of(params, net->attention.bias);
+    if (!frames) return GSF_OK;
+    gsf__parallel_for(r->ctx, (size_t)rows, gsf__mini_join_grad_row, r);
+    for (int64_t i = 0; i <= e; i++) {
+        double sum = 0.0;
+        for (int64_t row = 0; row < rows; row++) sum += r->dattention[row * (e + 1) + i];
+        float* to = i < e ? dweight ? dweight + i : NULL : dbias;
+        if (to) *to += (float)sum;
+    }
+    gsf__mini_relu_grad(r, r->features, frames * coarse * e, r->dfeatures);
+    GSF__TRY(gsf__mini_convolve_grad(r, params, &net->second, r->hidden, frames, 0, 0, r->dfeatures, 0, r->dhidden));
+    gsf__mini_relu_grad(r, r->hidden, frames * coarse * net->hidden, r->dhidden);
+    return gsf__mini_convolve_grad(r, params, &net->first, r->shown, frames, 0, 0, r->dhidden, 0, NULL);
+}
+
+// Adds the gradients of the weights to params->grad, after a forward pass of the same batch; r->dout and r->derror: those of
+// its results.
+GSF__SHARED gsf_result gsf__mini_backward(gsf__mini_run* r, gsf__nn_params* params) {
+    gsf__parallel_for(r->ctx, (size_t)(r->batch * r->height), gsf__mini_blend_grad_row, r);
+    GSF__TRY(gsf__mini_heads_grad(r, params));
+    GSF__TRY(gsf__mini_levels_grad(r, params));
+    return gsf__mini_references_grad(r, params);
+}
+
+/* The loss of a batch, mean over its frames: squared error relative to that of the render; Charbonnier's smoothed absolute
+   error; absolute error of the differences between neighbours; and the negative log likelihood of the error's size under the
+   Laplace distribution that `error` describes, whose slope does not reach the colours. */
+typedef struct gsf__mini_loss { double total, relative, square, before, likelihood; } gsf__mini_loss; // before: the render's
+
+enum { GSF__MINI_LOSS_TERMS = 5 }; // sums: charbonnier, square, the render's square, likelihood, neighbours
+
+typedef struct gsf__mini_loss_job {
+    const gsf__mini_run* r;
+    const float* truth; // (batch, height, width, 3)
+    double* sums;       // per row
+    const double* relative; // per frame: factor of the slope of its squared error
+    double pixels;      // of a frame, times the batch
+} gsf__mini_loss_job;
+
+static double gsf__mini_sign(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : 0.0; }
+
+static double gsf__mini_miss(const gsf__mini_loss_job* job, int64_t value) { // of a colour, by its index in out
+    return (double)job->r->out[value] - (double)job->truth[value];
+}
+
+static const double gsf__mini_loss_weight[4] = {2.0, 0.5, 0.02, 1e-3}; // charbonnier, neighbours, likelihood; its epsilon^2
+
+static void gsf__mini_loss_row(void* arg, size_t row, int32_t worker) {
+    const gsf__mini_loss_job* job = (const gsf__mini_loss_job*)arg;
+    const gsf__mini_run* r = job->r;
+    const int64_t w = r->width, y = (int64_t)row % r->height;
+    double* s = job->sums + row * GSF__MINI_LOSS_TERMS;
+    (void)worker;
+    memset(s, 0, GSF__MINI_LOSS_TERMS * sizeof *s);
+    for (int64_t x = 0; x < w; x++) {
+        const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
+        double size = 0.0;
+        for (int64_t c = 0; c < 3; c++) {
+            const int64_t at = 3 * p.fine + c;
+            const double e = gsf__mini_miss(job, at), render = (double)p.frame[c] + 0.5 - (double)job->truth[at];
+            s[0] += sqrt(e * e + gsf__mini_loss_weight[3]);
+            s[1] += e * e;
+            s[2] += render * render;
+            size += fabs(e) / 3.0;
+            if (x + 1 < w) s[4] += fabs(gsf__mini_miss(job, at + 3) - e);
+            if (y + 1 < r->height) s[4] += fabs(gsf__mini_miss(job, at + 3 * w) - e);
+        }
+        s[3] += size * exp(-(double)r->error[p.fine]) + (double)r->error[p.fine];
+    }
+}
+
+static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
+    const gsf__mini_loss_job* job = (const gsf__mini_loss_job*)arg;
+    const gsf__mini_run* r = job->r;
+    const int64_t w = r->width, y = (int64_t)row % r->height, b = (int64_t)row / r->height;
+    const double part = 1.0 / (3.0 * job->pixels), *weight = gsf__mini_loss_weight;
+    (void)worker;
+    for (int64_t x = 0; x < w; x++) {
+        const int64_t pixel = (int64_t)row * w + x;
+        double size = 0.0;
+        for (int64_t at = 3 * pixel; at < 3 * pixel + 3; at++) {
+            const double e = gsf__mini_miss(job, at);
+            double neighbours = 0.0;
+            if (x > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3));
+            if (x + 1 < w) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at + 3));
+            if (y > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3 * w));
+            if (y + 1 < r->height) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at + 3 * w));
+            size += fabs(e) / 3.0;
+            r->dout[at] = (float)(part * (weight[0] * e / sqrt(e * e + weight[3]) + weight[1] * neighbours +
+                                          2.0 * job->relative[b] * e));
+        }
+        r->derror[pixel] = (float)(weight[2] / job->pixels * (1.0 - size * exp(-(double)r->error[pixel])));
+    }
+}
+
+static const double gsf__mini_loss_floor = 1e-2; // added to the render's squared error
+
+// The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout and r->derror.
+GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* truth, gsf__mini_loss* loss) {
+    const int64_t rows = r->batch * r->height;
+    double relative[64], batch = (double)r->batch, pixels = (double)(r->height * r->width), values = 3.0 * pixels * batch;
+    gsf__mini_loss_job job = {r, truth, NULL, relative, pixels * batch};
+    memset(loss, 0, sizeof *loss);
+    if (r->batch > (int64_t)GSF__COUNT(relative))
+        return gsf_fail(r->ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: a batch of %lld frames", (long long)r->batch);
+    job.sums = (double*)gsf_alloc(r->ctx, (size_t)rows, GSF__MINI_LOSS_TERMS * sizeof(double));
+    if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(r->ctx, (size_t)rows, gsf__mini_loss_row, &job);
+    for (int64_t b = 0; b < r->batch; b++) {
+        double s[GSF__MINI_LOSS_TERMS] = {0};
+        for (int64_t y = 0; y < r->height; y++)
+            for (int i = 0; i < GSF__MINI_LOSS_TERMS; i++) s[i] += job.sums[(b * r->height + y) * GSF__MINI_LOSS_TERMS + i];
+        relative[b] = 1.0 / (s[2] / (3.0 * pixels) + gsf__mini_loss_floor);
+        loss->relative += relative[b] * s[1] / values;
+        loss->square += s[1] / values;
+        loss->before += s[2] / values;
+        loss->likelihood += s[3] / (pixels * batch);
+        loss->total += (gsf__mini_loss_weight[0] * s[0] + gsf__mini_loss_weight[1] * s[4]) / values;
+    }
+    loss->total += loss->relative + gsf__mini_loss_weight[2] * loss->likelihood;
+    gsf__parallel_for(r->ctx, (size_t)rows, gsf__mini_loss_grad_row, &job);
+    gsf_free(r->ctx, job.sums);
+    return GSF_OK;
+}
+
+// ---- training: a new mini
+
+typedef struct gsf__mini_maker {
+    gsf_context* ctx;
+    gsf_nn_tensor* tensors;
+    char (*names)[64];
+    float* values;
+    size_t count, used;
+    uint64_t seed;
+} gsf__mini_maker;
+
+// Adds a tensor of random weights; called twice, first only to count. Layers that feed sums start at zero.
+static gsf_result gsf__mini_make_tensor(void* user, const char* name, int32_t rank, const int64_t* shape,
+                                        const gsf_nn_tensor** to) {
+    gsf__mini_maker* m = (gsf__mini_maker*)user;
+    gsf_nn_tensor t = gsf_nn_wrap_tensor(name, m->values ? m->values + m->used : NULL, rank, shape);
+    const int64_t inputs = rank == 4 ? t.count / shape[0] : 1;
+    const int still = rank == 1 || strncmp(name, "head.", 5) == 0 || strncmp(name, "head_blend.", 11) == 0 ||
+                      strncmp(name, "reference.attention.", 20) == 0 || strstr(name, ".second.") != NULL;
+    (void)to;
+    for (int64_t i = 0; m->values && i < t.count; i++) {
+        const double normal = gsf_draw_normal(m->seed, m->count, (uint64_t)i);
+        m->values[m->used + (size_t)i] = still && strncmp(name, "reference.second", 16) != 0
+                                             ? 0.0f
+                                             : (float)(normal * sqrt(1.0 / (3.0 * (double)inputs)));
+        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 0) m->values[m->used + (size_t)i] = 6.0f;
+        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 5) m->values[m->used + (size_t)i] = -3.0f;
+        if (strcmp(name, "reference.second.bias") == 0) m->values[m->used + (size_t)i] = 0.0f;
+    }
+    if (m->tensors) {
+        snprintf(m->names[m->count], sizeof m->names[0], "%s", name);
+        t.name = m->names[m->count];
+        m->tensors[m->count] = t;
+    }
+    m->count++;
+    m->used += (size_t)t.count;
+    return GSF_OK;
+}
+
+// Writes a network of the sizes in `net` to a safetensors file. It begins as nearly the identity: the render has all but a
+// fiftieth of the weight or less.
+GSF__SHARED gsf_result gsf__mini_make(gsf_context* ctx, const gsf__mini* sizes, uint64_t seed, const char* path) {
+    gsf__mini net = *sizes;
+    gsf__mini_maker m;
+    memset(&m, 0, sizeof m);
+    m.ctx = ctx;
+    m.seed = seed;
+    GSF__TRY(gsf__mini_visit(&net, gsf__mini_make_tensor, &m));
+    gsf_nn_tensor* tensors = (gsf_nn_tensor*)gsf_alloc(ctx, m.count, sizeof *tensors);
+    m.names = (char (*)[64])gsf_alloc(ctx, m.count, sizeof *m.names);
+    m.values = (float*)gsf_alloc(ctx, m.used, sizeof(float));
+    m.tensors = tensors;
+    m.count = m.used = 0;
+    gsf_result result = m.tensors && m.names && m.values ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (!result) result = gsf__mini_visit(&net, gsf__mini_make_tensor, &m);
+    if (!result) result = gsf_nn_save_tensors(ctx, path, m.tensors, m.count);
+    gsf_free(ctx, m.values);
+    gsf_free(ctx, m.names);
+    gsf_free(ctx, tensors);
     return result;
 }
 

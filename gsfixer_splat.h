@@ -667,6 +667,11 @@ GSF_API gsf_fix_desc gsf_splat_get_fixer_desc(const gsf_fixer* fixer);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
 // The fixer's trainer, for rendering and export.
 GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
+// A filter on final renders: renders the trained splats for these cameras, all of the same size, and has the fixer's restorer
+// clean up the frames as one clip, with the photos that it has in the loop. color, confidence: `count` f32 images of that size
+// with 3 and 1 channels; the splats stay as they are. GSF_ERROR_INVALID_ARGUMENT without a restorer or within a round.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* fixer, const gsf_camera* cameras,
+                                                         size_t count, gsf_image* color, gsf_image* confidence);
 // Checkpoint between steps. A fixer made from the same desc, views and initial splats continues from it bit-identically.
 GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* fixer, gsf_buffer* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* fixer, const char* name,
@@ -13207,6 +13212,17 @@ static gsf_result gsf__keep_window(gsf_context* ctx, gsf_fixer* f, const gsf_res
     return GSF_OK;
 }
 
+// Lends the carrier to a window of frames at these cameras, with this depth.
+static void gsf__lend_carrier(gsf_fixer* f, gsf_restore_window* window, const gsf_image* depth) {
+    f->loan.carrier = &f->carrier;
+    f->loan.frame_count = window->frame_count;
+    f->loan.slot_count = f->limits.needs_carried < GSF__CARRY_SLOTS ? f->limits.needs_carried : GSF__CARRY_SLOTS;
+    f->loan.cameras = window->cameras;
+    f->loan.depth = depth;
+    window->carry_fn = f->limits.needs_carried > 0 ? gsf__carry_for_window : NULL;
+    window->carry_user = &f->loan;
+}
+
 static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
     const size_t begin = (size_t)f->window * (size_t)f->frames;
     int skip;
@@ -13225,13 +13241,7 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     window.alpha = f->limits.needs_alpha ? f->alpha : NULL;
     window.out_color = f->restored;
     window.out_confidence = f->confidence;
-    f->loan.carrier = &f->carrier;
-    f->loan.frame_count = f->frames;
-    f->loan.slot_count = f->limits.needs_carried < GSF__CARRY_SLOTS ? f->limits.needs_carried : GSF__CARRY_SLOTS;
-    f->loan.cameras = window.cameras;
-    f->loan.depth = f->depth;
-    window.carry_fn = f->limits.needs_carried > 0 ? gsf__carry_for_window : NULL;
-    window.carry_user = &f->loan;
+    gsf__lend_carrier(f, &window, f->depth);
     GSF__TRY(gsf__restore_or_skip(ctx, f, &window, &skip));
     if (!skip) GSF__TRY(gsf__keep_window(ctx, f, &window));
     f->skipped += skip;
@@ -13257,6 +13267,54 @@ static gsf_result gsf__finish_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
+static gsf_result gsf__render_views(gsf_context* ctx, const gsf_fixer* f, const gsf_camera* cameras, size_t count,
+                                    gsf_image* images) { // (3, count): colours, depths, opacities
+    for (size_t i = 0; i < count; i++) {
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        GSF__TRY(gsf__check_cancel(ctx));
+        GSF__TRY(gsf_check_camera(ctx, cameras + i));
+        for (size_t k = 0; k < 3; k++)
+            GSF__TRY(gsf_make_image(ctx, GSF_F32, cameras[i].width, cameras[i].height, k ? 1 : 3, &images[k * count + i]));
+        out.color = images[i];
+        out.depth = images[count + i];
+        out.alpha = images[2 * count + i];
+        GSF__TRY(gsf_splat_render_trainer(ctx, f->trainer, cameras + i, &out));
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras, size_t count,
+                                           gsf_image* color, gsf_image* confidence) {
+    gsf_restore_window window;
+    if (f->desc.rounds < 1 || f->restoring || count < 1 || count > 4096)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "restore: %zu views, without a restorer or within a round", count);
+    gsf_image* images = (gsf_image*)gsf_alloc_zeroed(ctx, count, 3 * sizeof *images);
+    int32_t* known = (int32_t*)gsf_alloc(ctx, count, sizeof *known);
+    gsf_result result = images && known ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; known && i < count; i++) known[i] = -1;
+    if (result == GSF_OK) result = gsf__render_views(ctx, f, cameras, count, images);
+    if (result == GSF_OK) result = gsf__open_references(ctx, f);
+    memset(&window, 0, sizeof window);
+    window.struct_size = sizeof window;
+    window.frame_count = (int32_t)count;
+    window.cameras = cameras;
+    window.reference_index = known;
+    window.seed = f->desc.train.seed;
+    window.clip = f->desc.rounds * f->desc.windows;
+    window.color = images;
+    window.depth = f->limits.needs_depth ? images + count : NULL;
+    window.alpha = f->limits.needs_alpha ? images + 2 * count : NULL;
+    window.out_color = color;
+    window.out_confidence = confidence;
+    gsf__lend_carrier(f, &window, images ? images + count : NULL);
+    if (result == GSF_OK) result = gsf_restore_clip(ctx, f->restorer, &window);
+    for (size_t i = 0; images && i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);
+    gsf_free(ctx, images);
+    gsf_free(ctx, known);
+    return result;
+}
+
 GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
     gsf_fix_stats ignored;
     if (!stats) stats = &ignored;
@@ -13280,6 +13338,7 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
         stats->stage = GSF_FIX_DONE;
     } else {
         stats->stage = GSF_FIX_TRAIN;
+        gsf__close_references(ctx, f); // which gsf_splat_restore_views has left open
         stats->lambda = f->trainer->restored.count ? gsf__restored_weight(f) : 0.0f;
         gsf_splat_set_restored_weight(f->trainer, stats->lambda);
         GSF__TRY(gsf_splat_step_trainer(ctx, f->trainer, &stats->train));

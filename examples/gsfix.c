@@ -30,7 +30,7 @@ typedef struct option_spec {
 static const option_spec option_specs[] = {
     {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset evaluate",
      "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
-    {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
+    {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info render",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
     {"--views", TEXT, AT(views), 0, 0, "3,6,9", "dataset",
@@ -55,15 +55,20 @@ static const option_spec option_specs[] = {
      "which tables to make, of restoration, reconstruction, conditions, trajectories (default: all that the lists allow)"},
     {"--benchmark", TEXT, AT(benchmark), 0, 0, "dl3dv|mipnerf360", "evaluate",
      "the scenes are those of this data set, by the names of their folders: the paper's printed figures stand beside ours"},
-    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info evaluate",
+    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info render evaluate",
      "hold out every Nth view by name (default 8)"},
     {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
     {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset evaluate",
      "shrink photos whose longer side exceeds this"},
-    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
-     "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
-     "diffusion model; exec is a program of yours, run as COMMAND JOBDIR"},
+    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", "fix restore",
+     "what repairs the rendered frames (fix: none by default): warp reprojects the photos; mini is a small network that\n"
+     "blends them (FILE: its weights, a safetensors file); dit is the paper's video diffusion model; exec is a program of\n"
+     "yours, run as COMMAND JOBDIR"},
+    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]", "render",
+     "clean up the renders with the training views (--views) of the scene: a filter, the splats stay as they are"},
+    {"--filtered", FLAG, AT(filtered), 0, 0, NULL, "fix",
+     "have the restorer clean up the final renders of the held-out views, too: filtered/, and figures of their own"},
     {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore evaluate",
      "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
@@ -153,7 +158,8 @@ static const option_spec option_specs[] = {
     {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset evaluate",
      "frames per sequence, both references included: longer captures are thinned out evenly (default 49); the captures of\n"
      "fewer photos are used as they are"},
-    {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
+    {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render",
+     "render the views of this scene; with --path, only its photos are used, by --restorer"},
     {"--path", TEXT, AT(path), 0, 0, "PATH.json", "fix render",
      "fix: repair frames at the cameras in this file, in every round, instead of on the path of --trajectory;\n"
      "render: render the cameras in this file"},
@@ -473,6 +479,10 @@ gsf_traj_kind gsfix_path_kind(const char* name) {
                                                    : GSF_TRAJ_SPREAD;
 }
 
+static int is_mini(const char* restorer) { // mini or mini:FILE
+    return strcmp(restorer, "mini") == 0 || (strncmp(restorer, "mini:", 5) == 0 && restorer[5]);
+}
+
 int gsfix_check_restorer(gsfix_app* app) {
     const char* r = app->o.restorer;
     const gsfix_options* o = &app->o;
@@ -494,9 +504,20 @@ int gsfix_check_restorer(gsfix_app* app) {
                         : o->any_frames             ? "--any-frames"
                                                     : NULL;
     if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
-    if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
+    if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0 || is_mini(r)) return 0;
     if (strncmp(r, "exec:", 5) == 0 && r[5]) return 0;
-    return gsfix_misused(app, "--restorer %s: choose from none|warp|dit:MODEL_DIR|exec:COMMAND", r);
+    return gsfix_misused(app, "--restorer %s: choose from none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", r);
+}
+
+#ifndef GSFIX_MODELS // the folder of the weights that come with the source code
+#define GSFIX_MODELS "examples/models"
+#endif
+
+// mini:FILE, else mini.safetensors in the folder named by the environment variable GSFIX_MODELS or in that of the source code
+gsfix_path gsfix_mini_path(const char* restorer) {
+    const char* folder = getenv("GSFIX_MODELS");
+    if (restorer[4] == ':') return gsfix_pathf("%s", restorer + 5);
+    return gsfix_pathf("%s/mini.safetensors", folder && folder[0] ? folder : GSFIX_MODELS);
 }
 
 const char* const gsfix_conditions[4] = {"both", "2d", "3d", "none"};
@@ -589,6 +610,13 @@ gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present) 
     *present = r && strcmp(r, "none") != 0;
     if (!*present) return GSF_OK;
     if (strcmp(r, "warp") == 0) return gsf_splat_make_warp(&app->ctx, out);
+    if (is_mini(r)) {
+        gsf_nn_mini_desc desc;
+        const gsfix_path path = gsfix_mini_path(r);
+        memset(&desc, 0, sizeof desc);
+        desc.path = path.s;
+        return gsf_nn_make_mini(&app->ctx, &desc, out);
+    }
     if (strncmp(r, "dit:", 4) == 0) {
         gsf_nn_dit_desc desc = gsfix_dit_desc(app);
         const gsfix_path checkpoint = gsfix_pathf("%s/dit.checkpoint", app->o.out);
@@ -610,6 +638,7 @@ gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and the checkpoints of
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
     if (!restorer->user) return;
     if (strcmp(app->o.restorer, "warp") == 0) gsf_splat_destroy_warp(&app->ctx, restorer);
+    else if (is_mini(app->o.restorer)) gsf_nn_destroy_mini(&app->ctx, restorer);
     else if (strncmp(app->o.restorer, "dit:", 4) == 0) gsf_nn_destroy_dit(&app->ctx, restorer);
     else gsfix_destroy_exec(&app->ctx, restorer);
 }
@@ -802,12 +831,57 @@ static gsf_result open_render_out(gsfix_app* app, const gsf_scene* scene, size_t
     return result == GSF_OK ? gsfix_remove_stale(app) : result;
 }
 
+// A fixer that trains nothing, with the training views of the scene as references and a restorer.
+typedef struct render_filter {
+    gsfix_split split;
+    gsf_train_view* views;
+    gsf_restorer restorer;
+    gsf_fixer* fixer;
+} render_filter;
+
+static gsf_result open_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats* splats, const gsf_render_desc* desc,
+                              render_filter* f) {
+    gsf_fix_desc fix = gsf_splat_resolve_few_view_desc(scene, GSF_QUALITY_BALANCED);
+    int present;
+    gsf_result result = gsfix_split_scene(app, scene, &f->split);
+    if (result == GSF_OK) result = gsfix_make_restorer(app, &f->restorer, &present);
+    if (result == GSF_OK)
+        result = gsf_splat_load_train_views(&app->ctx, scene, f->split.train, f->split.train_count, &f->views);
+    fix.train.render = *desc;
+    fix.train.seed = app->o.seed;
+    if (result == GSF_OK)
+        result = gsf_splat_make_fixer(&app->ctx, &fix, f->views, f->split.train_count, splats, &f->restorer, &f->fixer);
+    return result;
+}
+
+static void close_filter(gsfix_app* app, render_filter* f) {
+    gsf_splat_destroy_fixer(&app->ctx, f->fixer);
+    gsfix_destroy_restorer(app, &f->restorer);
+    gsf_free(&app->ctx, f->views);
+    gsfix_free_split(app, &f->split);
+}
+
+// Replaces a render by what the restorer makes of it.
+static gsf_result filter_one(gsfix_app* app, const render_filter* f, const gsf_camera* camera, const char* name) {
+    gsf_context* ctx = &app->ctx;
+    gsf_image color, confidence = {0};
+    gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
+    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, f->fixer, camera, 1, &color, &confidence);
+    if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name).s, &color);
+    gsf_destroy_image(ctx, &color);
+    gsf_destroy_image(ctx, &confidence);
+    return result;
+}
+
 static gsf_result render_all(gsfix_app* app, const float background[3]) {
     gsf_context* ctx = &app->ctx;
     gsf_scene scene = {0};
     gsf_splats splats = {0};
     gsf_camera* path = NULL;
     gsf_rasterizer* rasterizer = NULL;
+    render_filter filter = {0};
+    const int filtered = app->o.restorer && strcmp(app->o.restorer, "none") != 0;
     size_t count = 0;
     double seconds = 0.0;
     gsf_render_desc desc = {0};
@@ -816,20 +890,22 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
     memcpy(desc.background, background, sizeof desc.background);
     if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
-    if (result == GSF_OK && app->o.scene) count = scene.view_count;
+    if (result == GSF_OK && !app->o.path) count = scene.view_count;
     if (result == GSF_OK && count)
         desc.near_plane = app->o.scene ? gsf_splat_measure_near_plane(&scene.views[0].camera, sizeof scene.views[0],
-                                                                      count)
+                                                                      scene.view_count)
                                        : gsf_splat_measure_near_plane(path, sizeof *path, count);
-    if (result == GSF_OK) result = open_render_out(app, app->o.scene ? &scene : NULL, count);
+    if (result == GSF_OK) result = open_render_out(app, app->o.path ? NULL : &scene, count);
+    if (result == GSF_OK && filtered) result = open_filter(app, &scene, &splats, &desc, &filter);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
     gsfix_json_begin(ctx, &app->json, "frames", '[');
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
-        const gsfix_path name = frame_name(app->o.scene ? &scene : NULL, i);
+        const gsfix_path name = frame_name(app->o.path ? NULL : &scene, i);
+        const gsf_camera* camera = app->o.path ? path + i : &scene.views[i].camera;
         const double begin = gsfix_now();
         result = gsf_is_cancelled(ctx) ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped after %zu of %zu frames", i, count)
-                                       : render_one(app, rasterizer, &splats,
-                                                    app->o.scene ? &scene.views[i].camera : path + i, &desc, name.s);
+                                       : render_one(app, rasterizer, &splats, camera, &desc, name.s);
+        if (result == GSF_OK && filtered) result = filter_one(app, &filter, camera, name.s);
         seconds += gsfix_now() - begin;
         gsfix_json_text(ctx, &app->json, NULL, gsfix_pathf("%s.png", name.s).s);
         gsfix_progress(app, (double)(i + 1), (double)count, "frame %zu of %zu", i + 1, count);
@@ -840,6 +916,7 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
         gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s", count, splats.count, seconds,
                     app->o.out);
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
+    close_filter(app, &filter);
     gsf_free(ctx, path);
     gsf_splat_destroy_scene(ctx, &scene);
     gsf_splat_destroy(ctx, &splats);
@@ -847,7 +924,12 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
 }
 
 static int run_render(gsfix_app* app) {
-    if (!app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
+    const char* r = app->o.restorer;
+    const int filtered = r && strcmp(r, "none") != 0;
+    if (filtered && strcmp(r, "warp") != 0 && !is_mini(r))
+        return gsfix_misused(app, "--restorer %s: render takes none|warp|mini[:FILE]", r);
+    if (filtered && !app->o.scene) return gsfix_misused(app, "--restorer: needs the photos of a --scene");
+    if (!filtered && !app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
     float background[3];
     int32_t random;
     const int code = gsfix_background(app, background, &random);

@@ -19,7 +19,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *scene, *path, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark;
-    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks;
+    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     int clean_iterations, seeds;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
@@ -291,8 +291,9 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
     const gsfix_history* history;
     const char* out;
     const char* switches;    // JSON object
-    gsfix_score mean, without;
+    gsfix_score mean, without, filtered;
     const gsfix_score* views; // one per test view
+    const gsfix_score* filtered_views; // likewise, of the renders that the restorer has cleaned up; NULL: --filtered not given
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;
     gsf_render_desc render;   // what the splats were trained with, the near plane included

@@ -145,6 +145,7 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
     if (app->o.compare && !has_restorer(app))
         return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
+    if (app->o.filtered && !has_restorer(app)) return gsfix_misused(app, "--filtered: needs a --restorer");
     return gsfix_check_restorer(app);
 }
 
@@ -308,6 +309,27 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
         if (result == GSF_OK && folder)
             result = gsf_save_image(run->ctx, gsfix_pathf("%s/%s.png", folder, name.s).s, &color);
         gsf_destroy_image(run->ctx, &color);
+    }
+    return result;
+}
+
+// Has the restorer clean up the renders of all held-out views, and scores them.
+static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
+    gsf_context* ctx = run->ctx;
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
+        const gsf_camera* camera = &run->scene.views[run->split.test[i]].camera;
+        const gsfix_path name = gsfix_view_stem(&run->scene, run->split.test[i]);
+        gsf_image color, confidence = {0};
+        result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
+        if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
+        if (result == GSF_OK) result = gsf_splat_restore_views(ctx, run->fixer, camera, 1, &color, &confidence);
+        if (result == GSF_OK) gsfix_clamp(&color);
+        if (result == GSF_OK) result = score_view(run, i, &color, 1, scores + i);
+        if (result == GSF_OK)
+            result = gsf_save_image(ctx, gsfix_pathf("%s/filtered/%s.png", run->app->o.out, name.s).s, &color);
+        gsf_destroy_image(ctx, &color);
+        gsf_destroy_image(ctx, &confidence);
     }
     return result;
 }
@@ -791,6 +813,7 @@ static gsf_result open_fix_out(fix_run* run) {
         const gsfix_path stem = gsfix_view_stem(&run->scene, run->split.test[i]);
         result = gsfix_claim(app, "test/%s.png", stem.s);
         if (result == GSF_OK && app->o.compare) result = gsfix_claim(app, "report/without/%s.png", stem.s);
+        if (result == GSF_OK && app->o.filtered) result = gsfix_claim(app, "filtered/%s.png", stem.s);
     }
     for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app) && !run->task; i++)
         result = gsfix_claim(app, "%s", repair[i]);
@@ -1035,6 +1058,7 @@ static void write_views(fix_run* run, const gsfix_result* r, gsf_buffer* t) {
         gsfix_json_text(ctx, t, "file", gsfix_pathf("test/%s.png", gsfix_view_stem(&run->scene, run->split.test[i]).s).s);
         write_scores(ctx, t, "", r->views + i);
         if (run->history.has_without) write_scores(ctx, t, "_without_repair", run->history.without + i);
+        if (r->filtered_views) write_scores(ctx, t, "_filtered", r->filtered_views + i);
         gsfix_json_end(ctx, t, '}');
     }
     gsfix_json_end(ctx, t, ']');
@@ -1091,6 +1115,11 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_text(ctx, t, "scene", run->scene.folder);
     write_scores(ctx, t, "", &r->mean);
     if (h->has_without) write_scores(ctx, t, "_without_repair", &r->without);
+    if (r->filtered_views) {
+        gsfix_json_begin(ctx, t, "filtered", '{');
+        write_scores(ctx, t, "", &r->filtered);
+        gsfix_json_end(ctx, t, '}');
+    }
     gsfix_json_text(ctx, t, "measured",
                     masked_photos(run) ? "float32 render clamped to [0,1] against the 8-bit photo, over the pixels that count "
                                          "at least half (alpha, masks), the others black in both; ssim as ssim_3dgs"
@@ -1143,6 +1172,9 @@ static void print_results(fix_run* run, const gsfix_result* r) {
             gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair alone: %+.3f dB)",
                         r->without.psnr,
                         r->without.ssim, r->mean.psnr - r->without.psnr);
+        if (r->filtered_views)
+            gsfix_print(app, "filtered   PSNR %.3f dB  SSIM %.4f  (the same renders, cleaned up by the restorer)",
+                        r->filtered.psnr, r->filtered.ssim);
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
@@ -1172,7 +1204,8 @@ static gsf_result finish(fix_run* run) {
     const char* out = run->app->o.out;
     double clock = gsfix_now();
     gsfix_result r = {0};
-    gsfix_score* views = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *views);
+    const size_t tests = run->split.test_count;
+    gsfix_score* views = (gsfix_score*)gsf_alloc_zeroed(ctx, 2 * tests + 1, sizeof *views);
     if (!views) return GSF_ERROR_OUT_OF_MEMORY;
     r.scene = &run->scene;
     r.split = &run->split;
@@ -1188,7 +1221,13 @@ static gsf_result finish(fix_run* run) {
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);
-    r.mean = mean_score(views, run->split.test_count);
+    r.mean = mean_score(views, tests);
+    if (run->app->o.filtered && tests) {
+        if (result == GSF_OK) result = evaluate_filtered(run, views + tests);
+        r.filtered_views = views + tests;
+        r.filtered = mean_score(views + tests, tests);
+        add_seconds(run, GSFIX_RESTORE, &clock);
+    }
     r.without = mean_score(h->without, h->has_without ? run->split.test_count : 0);
     h->seconds_total = run->total_before + gsfix_now() - run->app->started;
     if (result == GSF_OK && run->task) {

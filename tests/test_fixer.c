@@ -648,6 +648,57 @@ static void test_loop(gsf_context* ctx) {
 
 // Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
 // refused immediately, unless no rounds are requested.
+// A filter on final renders gives the restorer's frames and changes nothing: a run with calls of it has the same splats.
+static void test_restore_views(gsf_context* ctx) {
+    static repair r;
+    static float color[2][3 * WIDTH * HEIGHT], truth[3 * WIDTH * HEIGHT], confidence[2][WIDTH * HEIGHT];
+    gsf_fixer *plain, *filtered, *trained;
+    gsf_fix_desc desc = repair_desc();
+    repair_setup(ctx, &r);
+    r.multiple = r.frames_step = 1;
+    desc.train.iterations = 12;
+    desc.first_round = 3;
+    desc.last_round = 6;
+    desc.window_frames = 9;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &plain));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &filtered));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, NULL, &trained));
+    const gsf_camera cameras[2] = {around(0.4, 0.1), around(-0.3, 0.0)};
+    gsf_image colors[2], confidences[2];
+    for (int i = 0; i < 2; i++) {
+        colors[i] = gsf_wrap_image(color[i], GSF_F32, WIDTH, HEIGHT, 3);
+        confidences[i] = gsf_wrap_image(confidence[i], GSF_F32, WIDTH, HEIGHT, 1);
+    }
+    int within = 0;
+    for (gsf_fix_stats stats = {0}; stats.stage != GSF_FIX_DONE;) {
+        const int begun = r.begun;
+        const int busy = stats.stage == GSF_FIX_PLAN || (stats.stage == GSF_FIX_RESTORE && stats.window < stats.windows);
+        within += busy;
+        const gsf_result expected = busy || stats.stage == GSF_FIX_RESTORE ? GSF_ERROR_INVALID_ARGUMENT : GSF_OK;
+        CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences), expected);
+        CHECK(r.begun - begun <= 1);
+        if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, filtered, &stats))) break;
+    }
+    CHECK(within > 0);
+    while (!run_steps(ctx, plain, 1, NULL)) continue;
+    CHECK(same_splats(plain, filtered));
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences));
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(truth, GSF_F32, WIDTH, HEIGHT, 3);
+    for (int i = 0; i < 2; i++) {
+        CHECK_OK(ctx, gsf_splat_render(ctx, r.rasterizer, &r.truth, &cameras[i], NULL, &out));
+        CHECK(memcmp(truth, color[i], sizeof truth) == 0 && confidence[i][0] == 0.8f);
+    }
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 0, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, trained, cameras, 2, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_splat_destroy_fixer(ctx, plain);
+    gsf_splat_destroy_fixer(ctx, filtered);
+    gsf_splat_destroy_fixer(ctx, trained);
+    CHECK(r.begun == r.ended);
+    repair_teardown(ctx, &r);
+}
+
 static void test_rigs(gsf_context* ctx) {
     for (int rig = 0; rig < 2; rig++) {
         static repair r;
@@ -1071,6 +1122,7 @@ int main(void) {
     test_mixed_windows(&ctx);
     test_explaining_restorer(&ctx);
     test_loop(&ctx);
+    test_restore_views(&ctx);
     test_rigs(&ctx);
     test_given_path(&ctx);
     test_native_frames(&ctx);

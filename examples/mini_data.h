@@ -1,0 +1,216 @@
+// mini_data.h - training data for the restorer mini, made from seeds. Part of train_mini.c.
+// SPDX-License-Identifier: MIT
+/* A scene is a made scene (make_scene.c), splats fitted to a few of its photos by the repair loop, and frames of the loop's own
+   path as a restorer gets them, just before the loop's rounds, with the photos carried into them and the ray-traced truth.
+   The file of a scene has one tensor, "frames": u8 (frames, height, width, 50), per pixel
+
+       render 3 | alpha | nearness | truth 3 |
+       3 times: photo 3, residual 3, score, depth ratio, angle, photo by the frame's depth 3, its validity, its depth ratio
+
+   that is the planes of gsf__mini_input, those within [-1,1] shifted by 128. */
+#ifndef MINI_DATA_H
+#define MINI_DATA_H
+
+#define MAKE_SCENE_NO_MAIN
+#include "make_scene.c"
+
+enum { DATA_REFERENCES = 3, DATA_FRAME = GSF__MINI_FRAME + 3, DATA_PIXEL = DATA_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE };
+enum { DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
+
+typedef struct data_desc { // of all scenes
+    const char* dir;
+    int pixels;      // the longer side; the other is two thirds of it
+    int fit;         // step of the last round
+} data_desc;
+
+static int data_is_signed(int plane) { // of a reference: kept within [-1,1]
+    return (plane >= 3 && plane < 6) || plane == 7 || plane == 13;
+}
+
+static uint8_t data_byte(float x, int is_signed) {
+    const float v = is_signed ? 128.0f + 127.0f * x : 255.0f * x;
+    return (uint8_t)(v <= 0.0f ? 0 : v >= 255.0f ? 255 : (int)(v + 0.5f));
+}
+static float data_float(uint8_t x, int is_signed) { return is_signed ? ((float)x - 128.0f) / 127.0f : (float)x / 255.0f; }
+
+typedef struct data_probe { // a restorer that restores nothing and writes down what it gets
+    world* s;
+    float exposure;
+    int rounds, help;      // rounds begun; 1: returns half of the truth, so that later rounds see repaired splats
+    size_t count, room;    // frames; of bytes
+    int64_t width, height;
+    uint8_t* bytes;
+} data_probe;
+
+static gsf_result probe_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                              gsf_restorer_info* out) {
+    (void)user, (void)ctx, (void)frames, (void)width, (void)height;
+    out->needs_depth = out->needs_alpha = 1;
+    out->needs_carried = DATA_REFERENCES;
+    return GSF_OK;
+}
+
+static gsf_result probe_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    (void)ctx, (void)references, (void)count;
+    ((data_probe*)user)->rounds++;
+    return GSF_OK;
+}
+
+static void probe_end(void* user, gsf_context* ctx) { (void)user, (void)ctx; }
+
+// The truth at a camera; the sensor's noise is that of a photo that the scene does not have.
+static gsf_result probe_truth(gsf_context* ctx, const data_probe* p, const gsf_camera* camera, uint8_t* out, float* spare) {
+    const size_t pixels = (size_t)(camera->width * camera->height);
+    photo_job job = {p->s, *camera, 1000 + p->count, out, spare, spare + pixels, p->exposure};
+    ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
+    return gsf_is_cancelled(ctx) ? GSF_ERROR_CANCELLED : GSF_OK;
+}
+
+static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore_window* w, int32_t frame, float* planes,
+                              uint8_t* truth) {
+    const gsf_image* depth = w->depth + frame;
+    const int64_t pixels = depth->width * depth->height;
+    uint8_t* out = p->bytes + p->count * (size_t)pixels * DATA_PIXEL;
+    gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, planes);
+    gsf__mini_plane_frame(w->color + frame, w->alpha + frame, depth, planes);
+    for (int64_t i = 0; i < pixels; i++) {
+        for (int k = 0; k < GSF__MINI_FRAME; k++) out[i * DATA_PIXEL + k] = data_byte(planes[i * GSF__MINI_FRAME + k], 0);
+        memcpy(out + i * DATA_PIXEL + GSF__MINI_FRAME, truth + 3 * i, 3);
+    }
+    for (int32_t slot = 0; slot < DATA_REFERENCES && result == GSF_OK; slot++) {
+        gsf_carried carried;
+        memset(&carried, 0, sizeof carried);
+        result = w->carry_fn(w->carry_user, ctx, frame, slot, &carried);
+        if (result != GSF_OK) break;
+        memset(planes, 0, (size_t)(pixels * GSF__MINI_REFERENCE) * sizeof(float));
+        if (carried.reference >= 0) gsf__mini_plane_reference(&carried, depth, planes);
+        for (int64_t i = 0; i < pixels; i++)
+            for (int k = 0; k < GSF__MINI_REFERENCE; k++)
+                out[i * DATA_PIXEL + DATA_FRAME + slot * GSF__MINI_REFERENCE + k] =
+                    data_byte(planes[i * GSF__MINI_REFERENCE + k], data_is_signed(k));
+    }
+    p->count += result == GSF_OK;
+    return result;
+}
+
+// Writes down every other frame of a window.
+static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_window* w) {
+    data_probe* p = (data_probe*)user;
+    const int64_t width = w->color[0].width, height = w->color[0].height, pixels = width * height;
+    if (!w->carry_fn) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "the loop carries no photos");
+    if (!p->bytes) {
+        p->width = width;
+        p->height = height;
+        p->room = (size_t)(pixels * DATA_PIXEL) * 3 * DATA_WINDOWS * DATA_WINDOW;
+        p->bytes = (uint8_t*)gsf_alloc(ctx, p->room, 1);
+    }
+    float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * GSF__MINI_REFERENCE, sizeof(float));
+    uint8_t* truth = (uint8_t*)gsf_alloc(ctx, (size_t)pixels, 3);
+    gsf_result result = p->bytes && planes && truth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
+        float *color = (float*)w->out_color[i].data, *confidence = (float*)w->out_confidence[i].data;
+        const int taken = w->reference_index[i] < 0 && (i + w->clip + p->rounds) % 2 == 0;
+        if (taken) result = probe_frame(ctx, p, w, i, planes, truth);
+        for (int64_t k = 0; k < pixels; k++) {
+            confidence[k] = p->help && taken ? 0.5f : 0.0f;
+            for (int64_t c = 3 * k; c < 3 * k + 3; c++)
+                color[c] = ((const float*)w->color[i].data)[c] * 0.5f + (taken ? (float)truth[c] : 0.0f) / 510.0f;
+        }
+    }
+    gsf_free(ctx, planes);
+    gsf_free(ctx, truth);
+    return result;
+}
+
+// The scene's options, from its seed: the layouts take turns.
+static make_scene_options data_options(const data_desc* d, uint64_t seed) {
+    make_scene_options o = make_scene_defaults;
+    const int upright = gsf_draw_uniform(seed, 1, 0) < 0.3;
+    o.seed = seed;
+    o.layout = 1 + (int)(seed % (LAYOUTS - 1));
+    o.views = DATA_VIEWS;
+    o.width = upright ? 2 * d->pixels / 3 : d->pixels;
+    o.height = upright ? d->pixels : 2 * d->pixels / 3;
+    o.points = 1500;
+    o.arc = 60.0 + 140.0 * gsf_draw_uniform(seed, 1, 1);
+    o.drift = gsf_draw_uniform(seed, 1, 2) < 0.4 ? 0.8 * gsf_draw_uniform(seed, 1, 3) : 0.0;
+    return o;
+}
+
+// Runs the loop with the probe until its last round is over.
+static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o,
+                           data_probe* p) {
+    static const size_t views_of[6] = {3, 3, 4, 5, 6, 9};
+    const uint64_t seed = o->seed;
+    gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};
+    uint32_t train[DATA_VIEWS], test[DATA_VIEWS];
+    size_t count, held_out;
+    gsf_scene scene;
+    gsf_train_view* views = NULL;
+    gsf_splats start;
+    gsf_fixer* fixer = NULL;
+    gsf_fix_stats now;
+    memset(&start, 0, sizeof start);
+    memset(&now, 0, sizeof now);
+    gsf_result result = gsf_splat_load_scene(ctx, folder, NULL, &scene);
+    gsf_splat_split_views(scene.view_count, 8, views_of[seed % 6], train, &count, test, &held_out);
+    for (size_t i = 0; i < count && result == GSF_OK; i++) { // as uncertain as poses from features are
+        gsf_camera* camera = &scene.views[train[i]].camera;
+        camera->cx += 0.2 * gsf_draw_normal(seed, 2, 2 * i);
+        camera->cy += 0.2 * gsf_draw_normal(seed, 2, 2 * i + 1);
+        p->exposure += log2f(exposure_of(o, train[i])) / (float)count;
+    }
+    p->exposure = exp2f(p->exposure);
+    if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
+    if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
+    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_EXACT);
+    desc.train.iterations = d->fit + 101;
+    desc.train.seed = seed;
+    desc.first_round = d->fit / 3;
+    desc.last_round = d->fit;
+    desc.windows = count < DATA_WINDOWS ? (int32_t)count : DATA_WINDOWS;
+    desc.window_frames = DATA_WINDOW;
+    if (result == GSF_OK) result = gsf_splat_make_fixer(ctx, &desc, views, count, &start, &restorer, &fixer);
+    while (result == GSF_OK && !(now.stage == GSF_FIX_RESTORE && now.round == now.rounds && now.window == now.windows) &&
+           now.stage != GSF_FIX_DONE)
+        result = gsf_splat_step_fixer(ctx, fixer, &now);
+    gsf_splat_destroy_fixer(ctx, fixer);
+    gsf_splat_destroy(ctx, &start);
+    gsf_free(ctx, views);
+    gsf_splat_destroy_scene(ctx, &scene);
+    return result;
+}
+
+// Makes the scene of a seed: DIR/scenes/SEED and then the file `path`.
+static gsf_result make_data(gsf_context* ctx, const data_desc* d, uint64_t seed, const char* path) {
+    const make_scene_options o = data_options(d, seed);
+    char folder[1024];
+    world s;
+    data_probe p;
+    memset(&s, 0, sizeof s);
+    memset(&p, 0, sizeof p);
+    snprintf(folder, sizeof folder, "%s/scenes/%llu", d->dir, (unsigned long long)seed);
+    if (!make_folder(d->dir, "") || !make_folder(d->dir, "/scenes") || make_scene(ctx, &o, folder) != 0)
+        return gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot make the scene", folder);
+    p.s = &s;
+    p.help = gsf_draw_uniform(seed, 1, 4) < 0.5;
+    gsf_result result = start_world(ctx, &s, &o) ? GSF_OK : gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: no scene", folder);
+    if (result == GSF_OK) result = data_run(ctx, d, folder, &o, &p);
+    gsf_nn_tensor frames;
+    memset(&frames, 0, sizeof frames);
+    frames.name = "frames";
+    frames.data = p.bytes;
+    frames.dtype = GSF_NN_U8;
+    frames.rank = 4;
+    frames.shape[0] = (int64_t)p.count;
+    frames.shape[1] = p.height;
+    frames.shape[2] = p.width;
+    frames.shape[3] = DATA_PIXEL;
+    frames.count = frames.shape[0] * frames.shape[1] * frames.shape[2] * frames.shape[3];
+    if (result == GSF_OK) result = gsf_nn_save_tensors(ctx, path, &frames, 1);
+    gsf_free(ctx, p.bytes);
+    end_world(&s);
+    return result;
+}
+
+#endif // MINI_DATA_H

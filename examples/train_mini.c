@@ -1,0 +1,337 @@
+/* train_mini - makes data for the restorer mini from seeds, and trains it
+   gcc -O2 -std=c11 -fopenmp -I. examples/train_mini.c -o train_mini -lm
+   (with Embree, which traces the rays faster: -DGSF_USE_EMBREE and -lembree3 or -lembree4)
+
+       train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
+           [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
+           [--pixels 216] [--fit 599]
+
+   DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
+   the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume
+   continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs
+   with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
+   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. */
+#ifndef _POSIX_C_SOURCE
+#define _POSIX_C_SOURCE 200809L
+#endif
+#define GSF_NN_TRAINING
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+#include "gsfixer_splat.h"
+
+#include "mini_data.h"
+#include "mini_batches.h"
+
+typedef struct seeds { uint64_t first, last; } seeds;
+
+typedef struct options {
+    const char *out, *data, *init;
+    seeds scenes, check;
+    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit;
+    uint64_t seed;
+    double rate;
+} options;
+
+typedef struct training {
+    gsf_context ctx;
+    options o;
+    gsf_nn_weights* files;       // of the scenes, then of those to check
+    const gsf_nn_tensor** scenes;
+    size_t scene_count, check_count;
+    gsf__mini net;
+    gsf__nn_params params;
+    gsf__mini_run run;
+    mini_batch batch;
+    gsf__mini_input* inputs;
+    float *planes, *truth;       // of all samples of a batch
+} training;
+
+static double cpu_minutes(void) { return (double)clock() / CLOCKS_PER_SEC / 60.0; }
+static double decibels(double square) { return -10.0 * log10(square > 1e-10 ? square : 1e-10); }
+
+// ---- data ------------------------------------------------------------------------
+
+static size_t seed_count(seeds s) { return s.last >= s.first && s.first ? (size_t)(s.last - s.first + 1) : 0; }
+
+static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
+    char path[2048];
+    gsf_nn_weights* file = t->files + index;
+    snprintf(path, sizeof path, "%s/%llu.safetensors", t->o.data, (unsigned long long)seed);
+    struct stat there;
+    if (stat(path, &there) != 0) {
+        const data_desc desc = {t->o.data, t->o.pixels, t->o.fit};
+        const gsf_result made = make_data(&t->ctx, &desc, seed, path);
+        if (made != GSF_OK) return made;
+        fprintf(stderr, "train_mini: scene %llu, %.1f CPU minutes\n", (unsigned long long)seed, cpu_minutes());
+    }
+    const gsf_result result = gsf_nn_load_weights(&t->ctx, path, NULL, file);
+    if (result != GSF_OK) return result;
+    const gsf_nn_tensor* frames = gsf_nn_find_tensor(file, "frames");
+    t->scenes[index] = frames;
+    if (frames && frames->dtype == GSF_NN_U8 && frames->rank == 4 && frames->shape[0] > 0 && frames->shape[1] >= t->o.crop &&
+        frames->shape[2] >= t->o.crop && frames->shape[3] == DATA_PIXEL)
+        return GSF_OK;
+    return gsf_fail(&t->ctx, GSF_ERROR_FORMAT, "%s: no frames of at least %d x %d pixels", path, t->o.crop, t->o.crop);
+}
+
+static gsf_result open_data(training* t) {
+    t->scene_count = seed_count(t->o.scenes);
+    t->check_count = seed_count(t->o.check);
+    const size_t all = t->scene_count + t->check_count;
+    t->files = (gsf_nn_weights*)gsf_alloc_zeroed(&t->ctx, all, sizeof *t->files);
+    t->scenes = (const gsf_nn_tensor**)gsf_alloc_zeroed(&t->ctx, all, sizeof *t->scenes);
+    if (!t->files || !t->scenes) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < all; i++) {
+        const uint64_t seed = i < t->scene_count ? t->o.scenes.first + i : t->o.check.first + (i - t->scene_count);
+        const gsf_result result = open_scene(t, i, seed);
+        if (result != GSF_OK) return result;
+    }
+    return GSF_OK;
+}
+
+// ---- training --------------------------------------------------------------------
+
+// A new network, or that of --init; its weights and the optimiser's state are those of OUT.state if the run continues.
+static gsf_result open_network(training* t) {
+    char first[2048], state[2048];
+    gsf__mini sizes;
+    memset(&sizes, 0, sizeof sizes);
+    sizes.hidden = 32;
+    sizes.features = sizes.shared = 16;
+    for (int l = 0; l < GSF__MINI_LEVELS; l++) {
+        sizes.width[l] = l ? 48 : 32;
+        sizes.blocks[l] = l > 1 ? 2 : 1;
+    }
+    snprintf(first, sizeof first, "%s.first", t->o.out);
+    snprintf(state, sizeof state, "%s.state", t->o.out);
+    gsf_result result = t->o.init ? GSF_OK : gsf__mini_make(&t->ctx, &sizes, t->o.seed, first);
+    if (result == GSF_OK) result = gsf__mini_open(&t->ctx, t->o.init ? t->o.init : first, NULL, 0, &t->net);
+    if (result == GSF_OK) result = gsf__nn_make_params(&t->ctx, &t->net.weights, NULL, 1, &t->params);
+    if (result == GSF_OK && t->o.resume) result = gsf__nn_load_params(&t->ctx, &t->params, state);
+    if (!t->o.init) remove(first);
+    return result;
+}
+
+static gsf_result make_batches(training* t) {
+    const size_t pixels = (size_t)(t->o.crop * t->o.crop), count = (size_t)t->o.batch;
+    const size_t planes = GSF__MINI_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE;
+    t->planes = (float*)gsf_alloc(&t->ctx, count * pixels, planes * sizeof(float));
+    t->truth = (float*)gsf_alloc(&t->ctx, count * pixels, 3 * sizeof(float));
+    t->inputs = (gsf__mini_input*)gsf_alloc_zeroed(&t->ctx, count, sizeof *t->inputs);
+    t->batch.samples = (mini_sample*)gsf_alloc_zeroed(&t->ctx, count, sizeof *t->batch.samples);
+    if (!t->planes || !t->truth || !t->inputs || !t->batch.samples) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < count; i++) {
+        mini_sample* s = t->batch.samples + i;
+        s->frame = t->planes + i * pixels * planes;
+        s->shown = s->frame + pixels * GSF__MINI_FRAME;
+        s->truth = t->truth + 3 * i * pixels;
+        t->inputs[i] = (gsf__mini_input){t->o.crop, t->o.crop, DATA_REFERENCES, s->frame, s->shown};
+    }
+    t->batch.scenes = t->scenes;
+    t->batch.scene_count = t->scene_count;
+    t->batch.crop = t->o.crop;
+    t->batch.count = t->o.batch;
+    t->batch.seed = t->o.seed;
+    return gsf__mini_begin(&t->ctx, &t->net, t->o.batch, DATA_REFERENCES, t->o.crop, t->o.crop, 1, &t->run);
+}
+
+static gsf_result save_state(training* t) {
+    char path[2048];
+    snprintf(path, sizeof path, "%s.state", t->o.out);
+    return gsf__nn_save_params(&t->ctx, &t->params, GSF__NN_SAVE_STATE, path);
+}
+
+// The moving average, rounded to bfloat16.
+static gsf_result save_network(training* t) {
+    const gsf_nn_weights* w = &t->net.weights;
+    gsf_nn_tensor* all = (gsf_nn_tensor*)gsf_alloc(&t->ctx, w->tensor_count, sizeof *all);
+    uint16_t* values = (uint16_t*)gsf_alloc(&t->ctx, (size_t)t->params.count, sizeof *values);
+    gsf_result result = all && values ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; result == GSF_OK && i < t->params.count; i++) values[i] = gsf__float_to_bf16(t->params.average[i]);
+    for (size_t i = 0; result == GSF_OK && i < w->tensor_count; i++) {
+        all[i] = w->tensors[i];
+        all[i].data = values + t->params.at[i];
+        all[i].dtype = GSF_NN_BF16;
+    }
+    if (result == GSF_OK) result = gsf_nn_save_tensors(&t->ctx, t->o.out, all, w->tensor_count);
+    gsf_free(&t->ctx, all);
+    gsf_free(&t->ctx, values);
+    return result;
+}
+
+static gsf_result train(training* t) {
+    gsf__nn_adam_desc adam;
+    gsf__mini_loss sum;
+    int counted = 0;
+    memset(&adam, 0, sizeof adam);
+    memset(&sum, 0, sizeof sum);
+    adam.lr = t->o.rate;
+    adam.beta2 = 0.99;
+    adam.weight_decay = 1e-4;
+    adam.max_norm = 1.0;
+    adam.warmup = t->o.steps < 200 ? t->o.steps / 2 : 100;
+    adam.steps = t->o.steps;
+    gsf_result result = GSF_OK;
+    while (t->params.step < t->o.steps && result == GSF_OK) {
+        const double step = (double)t->params.step;
+        gsf__mini_loss loss;
+        double norm;
+        t->batch.step = t->params.step;
+        t->ctx.parallel.for_fn(t->ctx.parallel.user, (size_t)t->o.batch, make_sample, &t->batch);
+        result = gsf__mini_forward(&t->run, t->inputs);
+        if (result == GSF_OK) result = gsf__mini_measure_loss(&t->run, t->truth, &loss);
+        if (result == GSF_OK) result = gsf__mini_backward(&t->run, &t->params);
+        adam.average = step / (step + 30.0) < 0.998 ? step / (step + 30.0) : 0.998; // short memory at first
+        if (result == GSF_OK) result = gsf__nn_step_adam(&t->ctx, &t->params, &adam, &norm);
+        if (result != GSF_OK) break;
+        sum.relative += loss.relative, sum.square += loss.square, sum.before += loss.before;
+        sum.likelihood += loss.likelihood;
+        counted++;
+        if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
+            fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f\n",
+                    (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
+                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted);
+            memset(&sum, 0, sizeof sum);
+            counted = 0;
+        }
+        if (t->params.step % t->o.save_every == 0 || t->params.step == t->o.steps) {
+            result = save_state(t);
+            if (result == GSF_OK) result = save_network(t);
+        }
+    }
+    return result;
+}
+
+// ---- measuring -------------------------------------------------------------------
+
+// PSNR of whole frames before and after, mean over the frames of a scene.
+static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_tensor* frames, double* before, double* after) {
+    const int64_t height = frames->shape[1], width = frames->shape[2], pixels = height * width;
+    const size_t planes = GSF__MINI_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE;
+    float* memory = (float*)gsf_alloc(&t->ctx, (size_t)pixels, (planes + 3) * sizeof(float));
+    gsf__mini_run run;
+    gsf_result result = gsf__mini_begin(&t->ctx, net, 1, DATA_REFERENCES, width, height, 0, &run);
+    if (!memory) result = GSF_ERROR_OUT_OF_MEMORY;
+    const mini_sample s = {memory, memory + pixels * GSF__MINI_FRAME, memory + pixels * (int64_t)planes};
+    const gsf__mini_input input = {width, height, DATA_REFERENCES, s.frame, s.shown};
+    *before = *after = 0.0;
+    for (int64_t f = 0; f < frames->shape[0] && result == GSF_OK; f++) {
+        double squares[2] = {0.0, 0.0};
+        const uint8_t* from = (const uint8_t*)frames->data + f * pixels * DATA_PIXEL;
+        for (int64_t i = 0; i < pixels; i++) read_pixel(from + i * DATA_PIXEL, s, i, pixels);
+        result = gsf__mini_forward(&run, &input);
+        for (int64_t y = 0; y < height && result == GSF_OK; y++)
+            for (int64_t x = 0; x < 3 * width; x++) {
+                const double truth = (double)s.truth[y * 3 * width + x];
+                const double a = (double)s.frame[(y * width + x / 3) * GSF__MINI_FRAME + x % 3] - truth;
+                const double b = (double)gsf__mini_clamp(run.out[y * 3 * run.width + x], 0.0f, 1.0f) - truth;
+                squares[0] += a * a;
+                squares[1] += b * b;
+            }
+        *before += decibels(squares[0] / (3.0 * (double)pixels)) / (double)frames->shape[0];
+        *after += decibels(squares[1] / (3.0 * (double)pixels)) / (double)frames->shape[0];
+    }
+    gsf__mini_end(&run);
+    gsf_free(&t->ctx, memory);
+    return result;
+}
+
+static gsf_result check(training* t) {
+    gsf__mini net;
+    double sum[2] = {0.0, 0.0};
+    if (!t->check_count) return GSF_OK;
+    gsf_result result = gsf__mini_open(&t->ctx, t->o.out, NULL, 0, &net);
+    for (size_t i = 0; i < t->check_count && result == GSF_OK; i++) {
+        double before, after;
+        result = check_scene(t, &net, t->scenes[t->scene_count + i], &before, &after);
+        if (result != GSF_OK) break;
+        printf("scene %llu: %.2f -> %.2f dB\n", (unsigned long long)(t->o.check.first + i), before, after);
+        sum[0] += before / (double)t->check_count;
+        sum[1] += after / (double)t->check_count;
+    }
+    if (result == GSF_OK) printf("mean: %.2f -> %.2f dB (%+.2f)\n", sum[0], sum[1], sum[1] - sum[0]);
+    gsf__mini_close(&t->ctx, &net);
+    return result;
+}
+
+// ---- command line ----------------------------------------------------------------
+
+static int usage(FILE* to) {
+    fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
+                "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
+                "Makes training data for the restorer mini from seeds, and trains it.\n");
+    return to == stdout ? 0 : 2;
+}
+
+static int parse_seeds(const char* text, seeds* out) { // "A-B", "A", or "0" for none
+    char* end;
+    out->first = strtoull(text, &end, 10);
+    out->last = *end == '-' ? strtoull(end + 1, &end, 10) : out->first;
+    return end != text && !*end && out->last >= out->first && out->last < 1000000000 && out->last - out->first < 10000;
+}
+
+static int parse_options(int argc, char** argv, options* o) {
+    for (int i = 1; i < argc; i++) {
+        const char* name = argv[i];
+        if (strcmp(name, "--quick") == 0) o->steps = 4000;
+        else if (strcmp(name, "--resume") == 0) o->resume = 1;
+        else if (strcmp(name, "--make-only") == 0) o->make_only = 1;
+        else if (name[0] != '-') {
+            if (o->out) return 0;
+            o->out = name;
+        } else {
+            if (++i == argc) return 0;
+            const char* value = argv[i];
+            char* end = NULL;
+            const double x = strtod(value, &end);
+            const int number = end != value && !*end && x >= 0.0 && x < 1e9;
+            if (strcmp(name, "--data") == 0) o->data = value;
+            else if (strcmp(name, "--init") == 0) o->init = value;
+            else if (strcmp(name, "--scenes") == 0) { if (!parse_seeds(value, &o->scenes)) return 0; }
+            else if (strcmp(name, "--check") == 0) { if (!parse_seeds(value, &o->check)) return 0; }
+            else if (!number) return 0;
+            else if (strcmp(name, "--steps") == 0) o->steps = (int)x;
+            else if (strcmp(name, "--batch") == 0) o->batch = (int)x;
+            else if (strcmp(name, "--crop") == 0) o->crop = (int)x;
+            else if (strcmp(name, "--rate") == 0) o->rate = x;
+            else if (strcmp(name, "--seed") == 0) o->seed = (uint64_t)x;
+            else if (strcmp(name, "--save-every") == 0) o->save_every = (int)x;
+            else if (strcmp(name, "--threads") == 0) o->threads = (int)x;
+            else if (strcmp(name, "--pixels") == 0) o->pixels = (int)x;
+            else if (strcmp(name, "--fit") == 0) o->fit = (int)x;
+            else return 0;
+        }
+    }
+    return o->out && o->data && seed_count(o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
+           o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 &&
+           2 * o->pixels / 3 >= o->crop;
+}
+
+int main(int argc, char** argv) {
+    static training t;
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 5e-4};
+    if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
+    if (!parse_options(argc, argv, &t.o)) return usage(stderr);
+    t.ctx.parallel.worker_count = t.o.threads;
+    gsf_result result = gsf_init_context(&t.ctx);
+    if (result == GSF_OK) result = open_data(&t);
+    if (result == GSF_OK && !t.o.make_only) {
+        result = open_network(&t);
+        if (result == GSF_OK) result = make_batches(&t);
+        if (result == GSF_OK) result = train(&t);
+        if (result == GSF_OK) result = check(&t);
+    }
+    if (result != GSF_OK) fprintf(stderr, "train_mini: %s\n", t.ctx.error);
+    gsf__mini_end(&t.run);
+    gsf__nn_destroy_params(&t.ctx, &t.params);
+    gsf__mini_close(&t.ctx, &t.net);
+    for (size_t i = 0; t.files && i < t.scene_count + t.check_count; i++) gsf_nn_destroy_weights(&t.ctx, t.files + i);
+    gsf_free(&t.ctx, t.files);
+    gsf_free(&t.ctx, (void*)t.scenes);
+    gsf_free(&t.ctx, t.planes);
+    gsf_free(&t.ctx, t.truth);
+    gsf_free(&t.ctx, t.inputs);
+    gsf_free(&t.ctx, t.batch.samples);
+    return result == GSF_OK ? 0 : 1;
+}

@@ -1,0 +1,74 @@
+#!/usr/bin/env bash
+# test_mini.sh TRAIN_MINI GSFIX SCRATCH: training of the restorer mini is the same for any number of threads and for a run that
+# was killed and resumed; what it learns makes the frames better; gsfix repairs with it, in the loop and as a filter; unusable
+# options and files give one line and an exit status.
+set -euo pipefail
+train=$1 gsfix=$2 scratch=$3
+[ -x "$train" ] && [ -x "$gsfix" ] && command -v python3 > /dev/null || { echo "SKIPPED: no program or python3"; exit 77; }
+rm -rf "$scratch"
+mkdir -p "$scratch"
+cd "$scratch"
+export OMP_WAIT_POLICY=passive # threads that wait must not spin
+fail() { echo "FAILED: $*"; exit 1; }
+
+data=(--data data --scenes 4 --check 4 --pixels 48 --fit 17 --crop 32)
+short=("${data[@]}" --batch 2 --steps 30 --save-every 5)
+"$train" one "${short[@]}" --threads 1 > one.txt
+grep -q "^mean: " one.txt || fail "no figures"
+"$train" three "${short[@]}" --threads 3 > three.txt
+cmp one three || fail "weights depend on the number of threads"
+cmp one.state three.state || fail "state depends on the number of threads"
+cmp one.txt three.txt || fail "figures depend on the number of threads"
+
+"$train" killed "${short[@]}" --threads 1 > /dev/null & # until it has written a state, then kill -9
+pid=$!
+for ((i = 0; i < 400; i++)); do
+    [ -e killed.state ] && break
+    sleep 0.05
+done
+kill -9 $pid 2> /dev/null || true
+wait $pid || true
+"$train" killed "${short[@]}" --threads 2 --resume > killed.txt
+cmp one killed || fail "a killed and resumed run has other weights"
+cmp one.state killed.state || fail "a killed and resumed run has another state"
+
+"$train" learned "${data[@]}" --batch 4 --steps 150 --rate 0.003 --threads 1 > learned.txt
+awk '/^mean: / { if ($4 < $2 + 0.3) exit 1 }' learned.txt || fail "it has learned nothing: $(tail -1 learned.txt)"
+
+scene=data/scenes/4
+for threads in 1 2; do
+    "$gsfix" fix "$scene" --out "fix$threads" --views 3 --iterations 40 --init tracks --restorer mini:learned --filtered \
+        --threads $threads --json > "fix$threads.json" 2> fix.txt || fail "gsfix fix: $(tail -1 fix.txt)"
+done
+cmp fix1/splats.ply fix2/splats.ply || fail "splats depend on the number of threads"
+ls fix1/filtered/*.png > /dev/null || fail "no filtered views"
+python3 - << 'PY' || fail "metrics.json"
+import json
+m = json.load(open("fix1/metrics.json"))
+views = [v["psnr_filtered"] for v in m["per_view"]]
+assert abs(m["filtered"]["psnr"] - sum(views) / len(views)) < 1e-9 and m["filtered"]["ssim"] is not None, m["filtered"]
+assert m["filtered"]["psnr"] != m["psnr"] and sum(r["frames_restored"] for r in m["rounds"]) > 0
+PY
+"$gsfix" render fix1/splats.ply --scene "$scene" --views 3 --restorer mini --out clean > /dev/null 2>&1 # weights that come along
+"$gsfix" render fix1/splats.ply --scene "$scene" --out plain > /dev/null 2>&1
+[ "$(ls clean/*.png | wc -l)" = "$(ls plain/*.png | wc -l)" ] || fail "not all views are rendered"
+cmp -s clean/frame_001.png plain/frame_001.png && fail "the filter changes nothing"
+for wrong in "fix $scene --out x --restorer mini:" "fix $scene --out x --filtered" \
+    "render fix1/splats.ply --path p.json --out x --restorer mini" "render fix1/splats.ply --scene $scene --out x --restorer dit:x"; do
+    status=0
+    "$gsfix" $wrong > /dev/null 2> error.txt || status=$?
+    [ $status = 2 ] && [ "$(wc -l < error.txt)" = 1 ] || fail "gsfix $wrong: status $status"
+done
+status=0
+"$gsfix" fix "$scene" --out x --views 3 --restorer mini:missing > /dev/null 2> error.txt || status=$?
+[ $status = 1 ] && grep -q missing error.txt || fail "weights that are not there: $(cat error.txt)"
+
+status=0
+"$train" --data data 2> error.txt || status=$?
+[ $status = 2 ] || fail "a missing output is no misuse"
+printf 'not a scene' > data/5.safetensors
+status=0
+"$train" none --data data --scenes 5 --crop 32 --pixels 48 2> error.txt || status=$?
+[ $status = 1 ] && [ "$(wc -l < error.txt)" = 1 ] && grep -q 5.safetensors error.txt || fail "a broken scene: $(cat error.txt)"
+[ ! -e none ] || fail "a failed run wrote weights"
+echo "passed"
