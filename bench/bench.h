@@ -47,7 +47,8 @@ static int bench_compare(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-static double bench_median(double* values, size_t count) {
+// Inline: not every bench uses it; likewise below.
+static inline double bench_median(double* values, size_t count) {
     qsort(values, count, sizeof *values, bench_compare);
     return count ? values[count / 2] : 0.0;
 }
@@ -140,7 +141,7 @@ GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int32_t
 }
 #endif
 
-static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops: per step
+static inline gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops: per step
 #if GSF__X86
     *flops = level >= GSF_CPU_AVX512 ? 32.0 : level >= GSF_CPU_AVX2 ? 16.0 : 8.0;
     if (level >= GSF_CPU_AVX512) return bench_fma_avx512;
@@ -164,7 +165,7 @@ static double bench_fastest(gsf_context* ctx, size_t chunks, gsf_chunk_fn body, 
 }
 
 // Runs a loop of FMA_CHAINS * FMA_ROUNDS steps of `work` each, prints the row and returns the rate.
-static double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work, const char* unit) {
+static inline double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work, const char* unit) {
     float sums[4 * 2 * 16];
     const double seconds = bench_fastest(ctx, 4, body, sums), all = work * FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * ctx->threads;
     const bench_row row = bench_make_row(name, ctx->cpu_level, ctx->threads, seconds, seconds * ctx->threads, all, unit);
