@@ -165,7 +165,8 @@ static double bench_fastest(gsf_context* ctx, size_t chunks, gsf_chunk_fn body, 
 }
 
 // Runs a loop of FMA_CHAINS * FMA_ROUNDS steps of `work` each, prints the row and returns the rate.
-static inline double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work, const char* unit) {
+static inline double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work,
+                                     const char* unit) {
     float sums[4 * 2 * 16];
     const double seconds = bench_fastest(ctx, 4, body, sums), all = work * FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * ctx->threads;
     const bench_row row = bench_make_row(name, ctx->cpu_level, ctx->threads, seconds, seconds * ctx->threads, all, unit);
