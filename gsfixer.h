@@ -643,8 +643,19 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__BEGIN_IMPLEMENTATION _Pragma("STDC FP_CONTRACT OFF")
 #define GSF__END_IMPLEMENTATION _Pragma("STDC FP_CONTRACT DEFAULT")
 #elif defined(__GNUC__)
-#define GSF__BEGIN_IMPLEMENTATION _Pragma("GCC push_options") _Pragma("GCC optimize(\"fp-contract=off\")")
-#define GSF__END_IMPLEMENTATION _Pragma("GCC pop_options")
+// g++ before 13 takes the operands that its AVX-512 intrinsics leave undefined for uninitialised variables (GCC bug 105593).
+#if defined(__cplusplus) && __GNUC__ < 13
+#define GSF__BEGIN_QUIET                                                                        \
+    _Pragma("GCC diagnostic push") _Pragma("GCC diagnostic ignored \"-Wuninitialized\"")        \
+        _Pragma("GCC diagnostic ignored \"-Wmaybe-uninitialized\"")
+#define GSF__END_QUIET _Pragma("GCC diagnostic pop")
+#else
+#define GSF__BEGIN_QUIET
+#define GSF__END_QUIET
+#endif
+#define GSF__BEGIN_IMPLEMENTATION \
+    GSF__BEGIN_QUIET _Pragma("GCC push_options") _Pragma("GCC optimize(\"fp-contract=off\")")
+#define GSF__END_IMPLEMENTATION _Pragma("GCC pop_options") GSF__END_QUIET
 #else
 #define GSF__BEGIN_IMPLEMENTATION
 #define GSF__END_IMPLEMENTATION
