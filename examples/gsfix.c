@@ -39,7 +39,7 @@ static const option_spec option_specs[] = {
      "numbers of training views (default 3,6,9); restorers and trajectories are compared with the first of them"},
     {"--restorers", TEXT, AT(restorers), 0, 0, "LIST", "evaluate",
      "what is compared, separated by commas (default plain,none,warp): plain, 3DGS without regularisers; none, with\n"
-     "regularisers for few views; warp, dit:MODEL_DIR and exec:COMMAND, these and a restorer as for gsfix fix"},
+     "regularisers for few views; warp, mini, dit:MODEL_DIR and exec:COMMAND, these and a restorer as for gsfix fix"},
     {"--trajectories", TEXT, AT(trajectories), 0, 0, "LIST", "evaluate",
      "camera paths of the frames to repair, of reference, ellipse, interpolate (default reference); several give the\n"
      "table that compares them"},
