@@ -522,7 +522,9 @@ static void test_shared(gsf_context* ctx) {
     size_t kept = 0, clone = clones, part = 2 * clones;
     for (size_t i = 0; i < COUNT; i++) {
         const int split = action[i] == GSF__SPLIT;
-        const size_t rows[2] = {split ? part : kept++, split ? part++ + splits : clone++};
+        const size_t rows[2] = {split ? part : kept, split ? part + splits : clone};
+        if (split) part++;
+        else kept++, clone++;
         const float *mean = was.groups[GSF__MEANS].value + 3 * i, *scale = was.groups[GSF__SCALES].value + 3 * i;
         const double opacity = 1.0 / (1.0 + exp(-(double)was.groups[GSF__OPACITY].value[i]));
         double clear = 1.0, apart = 0.0, longest = -INFINITY;
@@ -1137,7 +1139,7 @@ static void test_coarse(gsf_context* ctx, const scene* s) {
         const gsf__photo *small = coarse->coarse.photos + v, *photo = coarse->photos.photos + v;
         const size_t width = (size_t)small->camera.width, height = (size_t)small->camera.height;
         const double point[3] = {0.1, -0.2, 0.3};
-        double x, y, z, half_x, half_y, half_z;
+        double x = 0.0, y = 0.0, z, half_x = -1.0, half_y = -1.0, half_z;
         CHECK(width == WIDTH / 2 && height == HEIGHT / 2 && small->target.width == WIDTH / 2);
         CHECK(gsf_project_point(&photo->camera, point, &x, &y, &z) &&
               gsf_project_point(&small->camera, point, &half_x, &half_y, &half_z));
