@@ -11015,7 +11015,7 @@ static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer,
                                          gsf__visit_job* visits, gsf_train_stats* stats) {
     const gsf_train_desc* d = &trainer->desc;
     gsf__model* model = &trainer->model;
-    const int sharp = d->sharpness > 0.0f && iteration > d->sharpness_from;
+    const int sharp = d->sharpness > 0.0f && iteration > d->sharpness_from && model->count > 0;
     if (sharp)
         GSF__TRY(gsf__reserve(ctx, (void**)&trainer->means, &trainer->means_capacity, 0, model->count, 3 * sizeof(float)));
     GSF__TRY(gsf__trainer_accumulate(ctx, trainer, iteration, sharp ? 0.5f : 1.0f, visits, stats));
