@@ -77,12 +77,12 @@
                unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
                tokens, positions, latents.
    WHERE TO ADD
-       a restorer       gsf_restorer under "restorer interface": struct_size and all four functions. query_fn runs before
-                        begin_fn, and for every clip of gsf_restore_clip, so it changes nothing; begin_fn and end_fn run
-                        once per round. restore_fn writes every pixel of out_color and out_confidence, which are undefined
-                        before. If query_fn sets needs_carried, restore_fn may ask window->carry_fn (unless NULL, or
-                        beyond struct_size) for the photos as they appear in a frame. gsf_splat_make_warp in
-                        gsfixer_splat.h is an example
+       a restorer       gsf_restorer under "restorer interface": struct_size and the four functions from query_fn to
+                        end_fn. query_fn runs before begin_fn, and for every clip of gsf_restore_clip, so it changes
+                        nothing; begin_fn and end_fn run once per round. restore_fn writes every pixel of out_color and
+                        out_confidence, which are undefined before. If query_fn sets needs_carried, restore_fn may
+                        ask window->carry_fn (unless NULL, or beyond struct_size) for the photos as they appear in a
+                        frame. gsf_splat_make_warp in gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
    SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
@@ -374,30 +374,28 @@ GSF_API GSF_NODISCARD gsf_result gsf_resize_image(gsf_context* ctx, const gsf_im
 
 // ---- pixel metrics -------------------------------------------------------------
 
-typedef enum gsf_ssim_kind {
-    GSF_SSIM_3DGS,         // 11x11 Gaussian sigma 1.5, zero padding, variances not clamped: the 3DGS papers' figure
-    GSF_SSIM_TORCHMETRICS, // the same kernel, reflect padding, variances clamped at 0 (gsplat's trainer)
-    GSF_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the interior
-    GSF_SSIM_MULTISCALE,   // MS-SSIM (Wang et al. 2003) over five scales, as pytorch-msssim computes it: per channel, means
-                           // over the interior; halving an odd side pads it with a line of zeros in front
-    GSF_SSIM_MULTISCALE_TORCHMETRICS, // as torchmetrics does: over all channels together, the last scale with the reflected
-                           // border, variances clamped at 0; halving an odd side drops its last line
-} gsf_ssim_kind;
+typedef enum gsf_metric {
+    GSF_METRIC_PSNR,              // 10 log10(1/mse); +infinity for identical images
+    GSF_METRIC_DIFFERENCE,        // mean absolute difference. VBench's temporal flickering of a clip is 1 less its mean over
+                                  // pairs of successive frames
+    GSF_METRIC_SSIM_3DGS,         // 11x11 Gaussian sigma 1.5, zero padding, variances not clamped: the 3DGS papers' figure
+    GSF_METRIC_SSIM_TORCHMETRICS, // the same kernel, reflect padding, variances clamped at 0 (gsplat's trainer)
+    GSF_METRIC_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the interior
+    GSF_METRIC_MS_SSIM,           // MS-SSIM (Wang et al. 2003) over five scales, as pytorch-msssim computes it: per channel,
+                                  // means over the interior; halving an odd side pads it with a line of zeros in front
+    GSF_METRIC_MS_SSIM_TORCHMETRICS, // as torchmetrics does: over all channels together, the last scale with the reflected
+                                  // border, variances clamped at 0; halving an odd side drops its last line
+} gsf_metric;
 
 // Both images must have the same size and channel count; dtypes may differ (floats in [0,1], integers are scaled to
 // value / maximum). All sums are in double and in a fixed order. A NaN or infinity in a counted pixel gives
 // GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
 // them; MS-SSIM takes no mask). If the mask excludes all pixels, or the image is smaller than the windows need (sides of 6
-// pixels for TORCHMETRICS, 7 for SKIMAGE, 161 for MULTISCALE, 176 for MULTISCALE_TORCHMETRICS), the result is
-// GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
-GSF_API GSF_NODISCARD gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
-                                                  const gsf_image* mask, double* out);
-GSF_API GSF_NODISCARD gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a,
-                                                  const gsf_image* b, const gsf_image* mask, double* out);
-// The mean absolute difference. VBench's temporal flickering of a clip is 1 less its mean over pairs of successive frames.
-GSF_API GSF_NODISCARD gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
-                                                        const gsf_image* mask, double* out);
+// pixels for SSIM_TORCHMETRICS, 7 for SSIM_SKIMAGE, 161 for MS_SSIM, 176 for MS_SSIM_TORCHMETRICS), the result is
+// GSF_ERROR_DEGENERATE.
+GSF_API GSF_NODISCARD gsf_result gsf_measure_image(gsf_context* ctx, gsf_metric metric, const gsf_image* a, const gsf_image* b,
+                                                   const gsf_image* mask, double* out);
 
 // ---- cameras -------------------------------------------------------------------
 
@@ -508,7 +506,11 @@ typedef struct gsf_restorer {
     gsf_result (*begin_fn)(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count);
     gsf_result (*restore_fn)(void* user, gsf_context* ctx, const gsf_restore_window* window);
     void (*end_fn)(void* user, gsf_context* ctx); // releases what begin allocated; called once per successful begin
-} gsf_restorer;
+    void (*destroy_fn)(void* user, gsf_context* ctx); // releases user, for gsf_destroy_restorer only; NULL: nothing to release
+} gsf_restorer;                                       // struct_size may end before destroy_fn, which is then not there
+
+// Destroys a restorer, of the toolkit or of a host, and clears it. NULL and a cleared restorer are ignored.
+GSF_API void gsf_destroy_restorer(gsf_context* ctx, gsf_restorer* restorer);
 
 /* Restores a clip of any size and length. Call between begin_fn and end_fn. restore_fn gets only sizes and lengths that
    its limits allow; out_color and out_confidence receive the caller's frames at the caller's size.
@@ -1034,7 +1036,11 @@ GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t mos
     return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
 }
 
-enum { GSF__CARRIED_IMAGES = 7, GSF__WINDOW_BYTES = offsetof(gsf_restore_window, carry_fn) };
+enum {
+    GSF__CARRIED_IMAGES = 7,
+    GSF__WINDOW_BYTES = offsetof(gsf_restore_window, carry_fn),  // of a host
+    GSF__RESTORER_BYTES = offsetof(gsf_restorer, destroy_fn),    // that was written before the field existed
+};
 
 // The images of a gsf_carried in their order, and their channels.
 GSF__SHARED void gsf__list_carried(gsf_carried* carried, gsf_image* images[GSF__CARRIED_IMAGES],
@@ -4039,7 +4045,6 @@ static void gsf__pixel_rows(void* arg, size_t chunk, int32_t worker) {
 // The mean of squared or absolute differences.
 static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolute, const gsf_image* a, const gsf_image* b,
                                   const gsf_image* mask, double* out) {
-    GSF__TRY(gsf__check_image_pair(ctx, what, a, b, mask));
     gsf__pixel_job job;
     job.a = a;
     job.b = b;
@@ -4054,17 +4059,11 @@ static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolu
     return result;
 }
 
-GSF_API gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
-                                    double* out) {
+static gsf_result gsf__psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask, double* out) {
     double mse = 0.0;
     GSF__TRY(gsf__pixel_mean(ctx, "psnr", 0, a, b, mask, &mse));
     *out = mse > 0.0 ? -10.0 * log10(mse) : (double)INFINITY;
     return GSF_OK;
-}
-
-GSF_API gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
-                                          double* out) {
-    return gsf__pixel_mean(ctx, "difference", 1, a, b, mask, out);
 }
 
 /* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab; four where only
@@ -4112,7 +4111,7 @@ GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* cons
 
 typedef struct gsf__ssim_job {
     const gsf_image *a, *b, *mask;
-    gsf_ssim_kind kind;
+    gsf_metric kind;
     int taps, radius;
     double weights[GSF__SSIM_MAX_TAPS];
     int64_t inset;           // map rows and columns left out at each border
@@ -4125,6 +4124,10 @@ typedef struct gsf__ssim_job {
     void (*blur)(double* out, const double* const* rows, const double* weights, int taps, size_t n);
 } gsf__ssim_job;
 
+static int gsf__ssim_as_torchmetrics(gsf_metric kind) {
+    return kind == GSF_METRIC_SSIM_TORCHMETRICS || kind == GSF_METRIC_MS_SSIM_TORCHMETRICS;
+}
+
 static int64_t gsf__reflect(int64_t i, int64_t n) { return i < 0 ? -i : i >= n ? 2 * n - 2 - i : i; }
 
 // Blurs row y of both images along x, into five rows of `out` that are `pitch` doubles apart.
@@ -4135,7 +4138,7 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
     const int64_t radius = job->radius;
     const size_t width = (size_t)a->width, wide = width + 2 * (size_t)radius;
     if (y < 0 || y >= a->height) {
-        if (job->kind == GSF_SSIM_3DGS) { // zero padding
+        if (job->kind == GSF_METRIC_SSIM_3DGS) { // zero padding
             for (size_t q = 0; q < job->quantities; q++) memset(out + q * pitch, 0, width * sizeof(double));
             return;
         }
@@ -4148,7 +4151,7 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
                      pb + radius);
     for (int64_t x = -radius; x < 0; x++) { // pad both sides with zeros or the reflection
         const int64_t right = a->width - 1 - x; // as far outside the right border as x is outside the left
-        const int mirror = job->kind == GSF_SSIM_TORCHMETRICS || job->kind == GSF_SSIM_MULTISCALE_TORCHMETRICS;
+        const int mirror = gsf__ssim_as_torchmetrics(job->kind);
         for (int i = 0; i < 2; i++) {
             double* p = (i ? pb : pa) + radius;
             p[x] = mirror ? p[-x] : 0.0;
@@ -4169,13 +4172,13 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
     }
 }
 
-static double gsf__ssim_value(gsf_ssim_kind kind, int contrast, double ma, double mb, double maa, double mbb, double mab) {
+static double gsf__ssim_value(gsf_metric kind, int contrast, double ma, double mb, double maa, double mbb, double mab) {
     const double c1 = 0.01 * 0.01, c2 = 0.03 * 0.03;
     double va = maa - ma * ma, vb = mbb - mb * mb, cov = mab - ma * mb;
-    if (kind == GSF_SSIM_TORCHMETRICS || kind == GSF_SSIM_MULTISCALE_TORCHMETRICS) {
+    if (gsf__ssim_as_torchmetrics(kind)) {
         if (va < 0.0) va = 0.0;
         if (vb < 0.0) vb = 0.0;
-    } else if (kind == GSF_SSIM_SKIMAGE) { // unbiased covariance of 7 x 7 samples
+    } else if (kind == GSF_METRIC_SSIM_SKIMAGE) { // unbiased covariance of 7 x 7 samples
         va *= 49.0 / 48.0;
         vb *= 49.0 / 48.0;
         cov *= 49.0 / 48.0;
@@ -4219,7 +4222,7 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
 }
 
 // Sums the SSIM map, or its contrast, over each channel's chunks of rows: job->sums, freed by the caller.
-static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_ssim_kind kind, int contrast, const gsf_image* a, const gsf_image* b,
+static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_metric kind, int contrast, const gsf_image* a, const gsf_image* b,
                                 const gsf_image* mask, gsf__ssim_job* job) {
     // exp(-x^2 / (2 * 1.5^2)) / sum for x = 0..5. First row: the Inria 3DGS code rounds these taps to float32 and then their
     // products once more, so its window sums to 1 - 6.94e-8, which adds 6.94e-8 mu^2 to its variances. These are the rounded
@@ -4234,12 +4237,13 @@ static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_ssim_kind kind, int contra
     job->mask = mask;
     job->kind = kind;
     job->contrast = contrast;
-    job->quantities = kind == GSF_SSIM_TORCHMETRICS || kind == GSF_SSIM_MULTISCALE_TORCHMETRICS ? 5 : 4; // clamped one by one
-    job->taps = kind == GSF_SSIM_SKIMAGE ? 7 : 11;
+    job->quantities = gsf__ssim_as_torchmetrics(kind) ? 5 : 4; // variances clamped one by one
+    job->taps = kind == GSF_METRIC_SSIM_SKIMAGE ? 7 : 11;
     job->radius = job->taps / 2;
+    const double* half = gauss[kind != GSF_METRIC_SSIM_3DGS];
     for (int t = 0; t < job->taps; t++)
-        job->weights[t] = kind == GSF_SSIM_SKIMAGE ? 1.0 / 7.0 : gauss[kind != GSF_SSIM_3DGS][t < 5 ? 5 - t : t - 5];
-    if (kind == GSF_SSIM_SKIMAGE || kind == GSF_SSIM_MULTISCALE || contrast) job->inset = job->radius;
+        job->weights[t] = kind == GSF_METRIC_SSIM_SKIMAGE ? 1.0 / 7.0 : half[t < 5 ? 5 - t : t - 5];
+    if (kind == GSF_METRIC_SSIM_SKIMAGE || kind == GSF_METRIC_MS_SSIM || contrast) job->inset = job->radius;
     job->blur = GSF__KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
     job->chunks_per_channel = (size_t)((a->height - 2 * job->inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
     size_t chunks = 0;
@@ -4300,12 +4304,12 @@ static gsf_result gsf__halve_image(gsf_context* ctx, int pad, gsf_image* image) 
 }
 
 // Multiplies the means of one scale into `products`: one per channel, or a single one for all.
-static gsf_result gsf__ssim_scale(gsf_context* ctx, gsf_ssim_kind kind, int scale, const gsf_image* a, const gsf_image* b,
+static gsf_result gsf__ssim_scale(gsf_context* ctx, gsf_metric kind, int scale, const gsf_image* a, const gsf_image* b,
                                   double* products) {
     static const double weights[GSF__SSIM_SCALES] = {0.0448, 0.2856, 0.3001, 0.2363, 0.1333};
     gsf__ssim_job job;
     gsf_result result = gsf__ssim_sum(ctx, kind, scale + 1 < GSF__SSIM_SCALES, a, b, NULL, &job);
-    const size_t groups = kind == GSF_SSIM_MULTISCALE ? (size_t)a->channels : 1;
+    const size_t groups = kind == GSF_METRIC_MS_SSIM ? (size_t)a->channels : 1;
     const size_t chunks = job.chunks_per_channel * (size_t)a->channels / groups;
     for (size_t i = 0; i < groups && result == GSF_OK; i++) {
         double mean = 0.0;
@@ -4316,10 +4320,11 @@ static gsf_result gsf__ssim_scale(gsf_context* ctx, gsf_ssim_kind kind, int scal
     return result;
 }
 
-static gsf_result gsf__ssim_multiscale(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
-                                       double* out) {
+static gsf_result gsf__ms_ssim(gsf_context* ctx, gsf_metric kind, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                               double* out) {
+    if (mask) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ms-ssim: masks are not supported");
     gsf_image pair[2];
-    const size_t groups = kind == GSF_SSIM_MULTISCALE ? (size_t)a->channels : 1;
+    const size_t groups = kind == GSF_METRIC_MS_SSIM ? (size_t)a->channels : 1;
     double sum = 0.0, *products = (double*)gsf_alloc(ctx, groups, sizeof(double));
     gsf_result result = products ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     memset(pair, 0, sizeof pair);
@@ -4330,7 +4335,7 @@ static gsf_result gsf__ssim_multiscale(gsf_context* ctx, gsf_ssim_kind kind, con
     }
     for (int scale = 0; scale < GSF__SSIM_SCALES && result == GSF_OK; scale++) {
         for (int i = 0; i < 2 && scale > 0 && result == GSF_OK; i++)
-            result = gsf__halve_image(ctx, kind == GSF_SSIM_MULTISCALE, &pair[i]);
+            result = gsf__halve_image(ctx, kind == GSF_METRIC_MS_SSIM, &pair[i]);
         if (result == GSF_OK) result = gsf__ssim_scale(ctx, kind, scale, &pair[0], &pair[1], products);
     }
     for (size_t i = 0; i < groups && result == GSF_OK; i++) sum += products[i];
@@ -4341,25 +4346,29 @@ static gsf_result gsf__ssim_multiscale(gsf_context* ctx, gsf_ssim_kind kind, con
     return result;
 }
 
-GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
-                                    const gsf_image* mask, double* out) {
-    static const int64_t least[] = {1, 6, 7, 161, 176}; // of a side, by kind
+static gsf_result gsf__ssim(gsf_context* ctx, gsf_metric kind, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                            double* out) {
     gsf__ssim_job job;
-    GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));
-    if ((int)kind < 0 || (size_t)kind >= GSF__COUNT(least))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ssim: kind %d", (int)kind);
-    if (a->width < least[kind] || a->height < least[kind])
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
-                        (long long)a->height);
-    if (kind >= GSF_SSIM_MULTISCALE) {
-        if (mask) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ms-ssim: masks are not supported");
-        return gsf__ssim_multiscale(ctx, kind, a, b, out);
-    }
     gsf_result result = gsf__ssim_sum(ctx, kind, 0, a, b, mask, &job);
     if (result == GSF_OK)
         result = gsf__metric_mean(ctx, "ssim", job.sums, job.chunks_per_channel * (size_t)a->channels, out);
     gsf_free(ctx, job.sums);
     return result;
+}
+
+GSF_API gsf_result gsf_measure_image(gsf_context* ctx, gsf_metric metric, const gsf_image* a, const gsf_image* b,
+                                     const gsf_image* mask, double* out) {
+    static const int64_t least[] = {1, 1, 1, 6, 7, 161, 176}; // of a side, by metric
+    if ((int)metric < 0 || (size_t)metric >= GSF__COUNT(least))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "metric %d is unknown", (int)metric);
+    GSF__TRY(gsf__check_image_pair(ctx, "metric", a, b, mask));
+    if (a->width < least[metric] || a->height < least[metric])
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
+                        (long long)a->height);
+    if (metric == GSF_METRIC_PSNR) return gsf__psnr(ctx, a, b, mask, out);
+    if (metric == GSF_METRIC_DIFFERENCE) return gsf__pixel_mean(ctx, "difference", 1, a, b, mask, out);
+    if (metric >= GSF_METRIC_MS_SSIM) return gsf__ms_ssim(ctx, metric, a, b, mask, out);
+    return gsf__ssim(ctx, metric, a, b, mask, out);
 }
 
 // ---- >>cameras -----------------------------------------------------------------
@@ -4738,6 +4747,13 @@ static gsf_result gsf__clip_part(gsf_context* ctx, gsf__clip* c, int32_t part) {
     w.out_confidence = c->out_confidence;
     GSF__TRY(c->restorer->restore_fn(c->restorer->user, ctx, &w));
     return gsf__clip_give(ctx, c, begin);
+}
+
+GSF_API void gsf_destroy_restorer(gsf_context* ctx, gsf_restorer* restorer) {
+    if (!restorer) return;
+    const int whole = restorer->struct_size >= sizeof *restorer;
+    if (whole && restorer->destroy_fn) restorer->destroy_fn(restorer->user, ctx);
+    memset(restorer, 0, whole ? sizeof *restorer : restorer->struct_size);
 }
 
 GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer, const gsf_restore_window* window) {

@@ -603,7 +603,6 @@ typedef struct gsf_nn_dit_desc {
 // Progress: "clip" (0 of 1, at its start), then after each unit of work "caption", "text", "dinov2", "vggt",
 // "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
-GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- the restorer `mini` --------------------------------------------------------------
 
@@ -624,7 +623,6 @@ typedef struct gsf_nn_mini_desc {
    A file that is not such a network gives GSF_ERROR_FORMAT and the name of a tensor; a clip without carried photos, depth
    or opacity GSF_ERROR_UNSUPPORTED; a NaN or infinity GSF_ERROR_NUMERIC. */
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* desc, gsf_restorer* out);
-GSF_API void gsf_nn_destroy_mini(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- metrics that need networks -------------------------------------------------------
 /* One object measures one stream of frames, which are never held together: zero it, choose the kind and the folder with
@@ -14647,10 +14645,8 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     return !result && r->desc.int8 ? gsf_nn_quantize_transformer(ctx, &r->transformer, NULL) : result;
 }
 
-GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
-    gsf__dit_restorer* r = (gsf__dit_restorer*)restorer->user;
-    memset(restorer, 0, sizeof *restorer);
-    if (!r) return;
+static void gsf__dit_destroy(void* user, gsf_context* ctx) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
     gsf__dit_end(r, ctx);
     gsf_nn_destroy_transformer(ctx, &r->transformer);
     gsf_nn_destroy_vae(ctx, &r->vae);
@@ -14700,7 +14696,8 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
     out->begin_fn = gsf__dit_begin;
     out->restore_fn = gsf__dit_restore;
     out->end_fn = gsf__dit_end;
-    if (result) gsf_nn_destroy_dit(ctx, out);
+    out->destroy_fn = gsf__dit_destroy;
+    if (result) gsf_destroy_restorer(ctx, out);
     return result;
 }
 
@@ -15413,10 +15410,8 @@ static gsf_result gsf__mini_restore(void* user, gsf_context* ctx, const gsf_rest
     return GSF_OK;
 }
 
-GSF_API void gsf_nn_destroy_mini(gsf_context* ctx, gsf_restorer* restorer) {
-    gsf__mini_restorer* r = (gsf__mini_restorer*)restorer->user;
-    memset(restorer, 0, sizeof *restorer);
-    if (!r) return;
+static void gsf__mini_destroy(void* user, gsf_context* ctx) {
+    gsf__mini_restorer* r = (gsf__mini_restorer*)user;
     gsf__mini_end_photos(r, ctx);
     gsf__mini_close(ctx, &r->net);
     gsf_free(ctx, r);
@@ -15441,8 +15436,9 @@ GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* de
     out->begin_fn = gsf__mini_begin_photos;
     out->restore_fn = gsf__mini_restore;
     out->end_fn = gsf__mini_end_photos;
+    out->destroy_fn = gsf__mini_destroy;
     const gsf_result result = gsf__mini_open(ctx, desc->path, desc->data, desc->size, &r->net);
-    if (result) gsf_nn_destroy_mini(ctx, out);
+    if (result) gsf_destroy_restorer(ctx, out);
     return result;
 }
 

@@ -591,10 +591,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 // the depth, the residual is added with less weight and less confidence; where no reference sees a pixel, the render is kept
 // with confidence 0. Floaters, identified by two references that see through them, are
 // replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
-// splats. Without renders of the references, colours are taken everywhere. Fills *out; out->user is freed by
-// gsf_splat_destroy_warp.
+// splats. Without renders of the references, colours are taken everywhere. Destroy with
+// gsf_destroy_restorer.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
-GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- the repair loop -----------------------------------------------------------
 /* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
@@ -12587,6 +12586,11 @@ static gsf_result gsf__warp_restore(void* user, gsf_context* ctx, const gsf_rest
     return GSF_OK;
 }
 
+static void gsf__warp_destroy(void* user, gsf_context* ctx) {
+    gsf__warp_end(user, ctx);
+    gsf_free(ctx, user);
+}
+
 GSF_API gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out) {
     memset(out, 0, sizeof *out);
     out->user = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__warp));
@@ -12597,13 +12601,8 @@ GSF_API gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out) {
     out->begin_fn = gsf__warp_begin;
     out->restore_fn = gsf__warp_restore;
     out->end_fn = gsf__warp_end;
+    out->destroy_fn = gsf__warp_destroy;
     return GSF_OK;
-}
-
-GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer) {
-    if (restorer->user) gsf__warp_end(restorer->user, ctx);
-    gsf_free(ctx, restorer->user);
-    memset(restorer, 0, sizeof *restorer);
 }
 
 // ---- >>seen mask ---------------------------------------------------------------
@@ -12749,7 +12748,7 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf__close_references(ctx, f);
     gsf__carrier_forget(ctx, &f->carrier);
     gsf_free(ctx, f->points);
-    gsf_splat_destroy_warp(ctx, &f->explain);
+    gsf_destroy_restorer(ctx, &f->explain);
     gsf__drop_window(ctx, f);
     gsf__drop_frames(ctx, &f->pending);
     gsf__drop_path(ctx, f);
@@ -12795,7 +12794,7 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
-    if (restorer && (restorer->struct_size < sizeof(gsf_restorer) || !restorer->query_fn || !restorer->begin_fn ||
+    if (restorer && (restorer->struct_size < GSF__RESTORER_BYTES || !restorer->query_fn || !restorer->begin_fn ||
                      !restorer->restore_fn || !restorer->end_fn))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer's struct_size or a function is missing");
     return GSF_OK;

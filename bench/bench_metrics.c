@@ -235,15 +235,12 @@ static void draw_frame(uint8_t* out, int t, int offset) {
             }
 }
 
-typedef enum bench_pixel { BENCH_PSNR = -7, BENCH_SSIM_3DGS, BENCH_SSIM_TORCHMETRICS, BENCH_SSIM_SKIMAGE, BENCH_MS_SSIM,
-                           BENCH_MS_SSIM_TORCHMETRICS, BENCH_FLICKERING } bench_pixel; // kinds without a network
+#define PIXELS(metric) (-1 - (int)GSF_METRIC_##metric) // the kind of a metric without a network
 
 static void measure_frame(gsf_context* ctx, gsf_nn_metric* metric, int kind, const gsf_image* frame, const gsf_image* other) {
     double value;
     if (kind >= 0) bench_require(ctx, gsf_nn_measure_frame(ctx, metric, frame, other));
-    else if (kind == BENCH_PSNR) bench_require(ctx, gsf_measure_psnr(ctx, frame, other, NULL, &value));
-    else if (kind == BENCH_FLICKERING) bench_require(ctx, gsf_measure_difference(ctx, frame, other, NULL, &value));
-    else bench_require(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)(kind - BENCH_SSIM_3DGS), frame, other, NULL, &value));
+    else bench_require(ctx, gsf_measure_image(ctx, (gsf_metric)(-1 - kind), frame, other, NULL, &value));
 }
 
 static double peak_rss(void) { // of this program, in bytes; 0: unknown. ru_maxrss would include the one that started it
@@ -298,9 +295,10 @@ static void bench_one(const bench_options* o, int threads, const char* metric_na
 
 int main(int argc, char** argv) {
     static const struct { const char* name; int kind; } cases[] = {
-        {"psnr", BENCH_PSNR}, {"ssim_3dgs", BENCH_SSIM_3DGS}, {"ssim_torchmetrics", BENCH_SSIM_TORCHMETRICS},
-        {"ssim_skimage", BENCH_SSIM_SKIMAGE}, {"ms_ssim", BENCH_MS_SSIM}, {"ms_ssim_torchmetrics", BENCH_MS_SSIM_TORCHMETRICS},
-        {"temporal_flickering", BENCH_FLICKERING}, {"lpips_alex", GSF_NN_METRIC_LPIPS_ALEX},
+        {"psnr", PIXELS(PSNR)}, {"ssim_3dgs", PIXELS(SSIM_3DGS)}, {"ssim_torchmetrics", PIXELS(SSIM_TORCHMETRICS)},
+        {"ssim_skimage", PIXELS(SSIM_SKIMAGE)}, {"ms_ssim", PIXELS(MS_SSIM)},
+        {"ms_ssim_torchmetrics", PIXELS(MS_SSIM_TORCHMETRICS)},
+        {"temporal_flickering", PIXELS(DIFFERENCE)}, {"lpips_alex", GSF_NN_METRIC_LPIPS_ALEX},
         {"lpips_vgg", GSF_NN_METRIC_LPIPS_VGG}, {"lpips_squeeze", GSF_NN_METRIC_LPIPS_SQUEEZE},
         {"i2v_subject", GSF_NN_METRIC_I2V_SUBJECT}, {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND},
         {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS}};

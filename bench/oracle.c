@@ -271,7 +271,7 @@ static gsf_result run_warp(job* j) {
                 result = warp.restore_fn(warp.user, ctx, &window);
                 warp.end_fn(warp.user, ctx);
             }
-            gsf_splat_destroy_warp(ctx, &warp);
+            gsf_destroy_restorer(ctx, &warp);
         }
     }
     free_list(ctx, render, photos);

@@ -635,14 +635,6 @@ gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and the checkpoints of
     return result;
 }
 
-void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
-    if (!restorer->user) return;
-    if (strcmp(app->o.restorer, "warp") == 0) gsf_splat_destroy_warp(&app->ctx, restorer);
-    else if (is_mini(app->o.restorer)) gsf_nn_destroy_mini(&app->ctx, restorer);
-    else if (strncmp(app->o.restorer, "dit:", 4) == 0) gsf_nn_destroy_dit(&app->ctx, restorer);
-    else gsfix_destroy_exec(&app->ctx, restorer);
-}
-
 // ---- info ------------------------------------------------------------------------
 
 static int compare_doubles(const void* a, const void* b) {
@@ -856,7 +848,7 @@ static gsf_result open_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats
 
 static void close_filter(gsfix_app* app, render_filter* f) {
     gsf_splat_destroy_fixer(&app->ctx, f->fixer);
-    gsfix_destroy_restorer(app, &f->restorer);
+    gsf_destroy_restorer(&app->ctx, &f->restorer);
     gsf_free(&app->ctx, f->views);
     gsfix_free_split(app, &f->split);
 }
@@ -1055,18 +1047,18 @@ static int run_path(gsfix_app* app) {
 
 typedef struct metric_spec {
     const char* name;
-    int net;      // a gsf_nn_metric_kind, or one of those below
+    int net;      // a gsf_nn_metric_kind, or PIXELS of a gsf_metric
     int raw, clip; // for LPIPS; measures DIR_A as a clip
 } metric_spec;
 
-enum { FLICKERING = -7, MS_SSIM, MS_SSIM_TORCHMETRICS, PSNR, SSIM_3DGS, SSIM_TORCHMETRICS, SSIM_SKIMAGE }; // values of `net`
+#define PIXELS(metric) (-1 - (int)GSF_METRIC_##metric) // and back: (gsf_metric)(-1 - net)
 static const metric_spec metric_specs[] = {
-    {"psnr", PSNR, 0, 0},
-    {"ssim_3dgs", SSIM_3DGS, 0, 0},
-    {"ssim_torchmetrics", SSIM_TORCHMETRICS, 0, 0},
-    {"ssim_skimage", SSIM_SKIMAGE, 0, 0},
-    {"ms_ssim", MS_SSIM, 0, 0},
-    {"ms_ssim_torchmetrics", MS_SSIM_TORCHMETRICS, 0, 0},
+    {"psnr", PIXELS(PSNR), 0, 0},
+    {"ssim_3dgs", PIXELS(SSIM_3DGS), 0, 0},
+    {"ssim_torchmetrics", PIXELS(SSIM_TORCHMETRICS), 0, 0},
+    {"ssim_skimage", PIXELS(SSIM_SKIMAGE), 0, 0},
+    {"ms_ssim", PIXELS(MS_SSIM), 0, 0},
+    {"ms_ssim_torchmetrics", PIXELS(MS_SSIM_TORCHMETRICS), 0, 0},
     {"lpips_alex", GSF_NN_METRIC_LPIPS_ALEX, 0, 0},
     {"lpips_vgg", GSF_NN_METRIC_LPIPS_VGG, 0, 0},
     {"lpips_squeeze", GSF_NN_METRIC_LPIPS_SQUEEZE, 0, 0},
@@ -1077,7 +1069,7 @@ static const metric_spec metric_specs[] = {
     {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND, 0, 1},
     {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS, 0, 1},
     {"overall_consistency", GSF_NN_METRIC_OVERALL_CONSISTENCY, 0, 1},
-    {"temporal_flickering", FLICKERING, 0, 1},
+    {"temporal_flickering", PIXELS(DIFFERENCE), 0, 1},
 };
 enum { METRIC_COUNT = sizeof metric_specs / sizeof *metric_specs };
 
@@ -1088,24 +1080,17 @@ typedef struct metric_run {
 
 // Of a pair of images. Masks apply to the metrics of pixels that have one scale.
 static int measures_pair(const metric_run* run, int m, int seen) {
-    return run->wanted[m] && !metric_specs[m].clip && (!seen || (metric_specs[m].net < 0 && metric_specs[m].net >= PSNR));
+    const int net = metric_specs[m].net, masked = net < 0 && net >= PIXELS(SSIM_SKIMAGE);
+    return run->wanted[m] && !metric_specs[m].clip && (!seen || masked);
 }
 
 static gsf_result measure(gsf_context* ctx, metric_run* run, int m, const gsf_image* a, const gsf_image* b,
                           const gsf_image* mask, double* out) {
-    gsf_result result;
-    switch (metric_specs[m].net) {
-        case PSNR: return gsf_measure_psnr(ctx, a, b, mask, out);
-        case SSIM_3DGS: return gsf_measure_ssim(ctx, GSF_SSIM_3DGS, a, b, mask, out);
-        case SSIM_TORCHMETRICS: return gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, a, b, mask, out);
-        case SSIM_SKIMAGE: return gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, a, b, mask, out);
-        case MS_SSIM: return gsf_measure_ssim(ctx, GSF_SSIM_MULTISCALE, a, b, mask, out);
-        case MS_SSIM_TORCHMETRICS: return gsf_measure_ssim(ctx, GSF_SSIM_MULTISCALE_TORCHMETRICS, a, b, mask, out);
-        default:
-            result = gsf_nn_measure_frame(ctx, &run->nets[m], a, b);
-            *out = run->nets[m].last;
-            return result;
-    }
+    const int net = metric_specs[m].net;
+    if (net < 0) return gsf_measure_image(ctx, (gsf_metric)(-1 - net), a, b, mask, out);
+    const gsf_result result = gsf_nn_measure_frame(ctx, &run->nets[m], a, b);
+    *out = run->nets[m].last;
+    return result;
 }
 
 // Opens the networks of the wanted metrics, so that a missing file is reported before any work.
@@ -1199,8 +1184,9 @@ static gsf_result measure_frame(gsf_context* ctx, metric_run* run, int m, const 
                                 const gsf_image* input) {
     gsf_nn_metric* net = &run->nets[m];
     double change = 0.0;
-    if (metric_specs[m].net != FLICKERING) return gsf_nn_measure_frame(ctx, net, frame, input);
-    const gsf_result result = before->data ? gsf_measure_difference(ctx, before, frame, NULL, &change) : GSF_OK;
+    if (metric_specs[m].net >= 0) return gsf_nn_measure_frame(ctx, net, frame, input);
+    gsf_result result = GSF_OK;
+    if (before->data) result = gsf_measure_image(ctx, (gsf_metric)(-1 - metric_specs[m].net), before, frame, NULL, &change);
     net->last += change; // the sum, as there is no network
     net->score = net->count ? 1.0 - net->last / (double)net->count : 1.0;
     net->count++;
@@ -1631,7 +1617,7 @@ static gsf_result restore_folder(gsfix_app* app) {
                     gsfix_now() - begin, app->o.out);
         gsfix_print_stages(app);
     }
-    gsfix_destroy_restorer(app, &restorer);
+    gsf_destroy_restorer(&app->ctx, &restorer);
     gsfix_free_clip(app, &c);
     return result;
 }

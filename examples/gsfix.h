@@ -147,9 +147,8 @@ void gsfix_leave_job(gsfix_app* app, int remove);
 
 // ---- gsfix_exec.c --------------------------------------------------------------
 
-// Restorer that runs `COMMAND JOBDIR` for each window. Freed by gsfix_destroy_exec.
+// Restorer that runs `COMMAND JOBDIR` for each window.
 gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, gsf_restorer* out);
-void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- gsfix.c: shared by several commands ------------------------------------------
 
@@ -165,7 +164,6 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 // Returns 0, or an exit code after printing a message.
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present);
-void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
 void gsfix_json_stages(gsfix_app* app, gsf_buffer* text); // "restorer_stages": [...], if there are any
 void gsfix_print_stages(gsfix_app* app);
 extern const char* const gsfix_conditions[4]; // names of gsf_nn_condition for --condition

@@ -495,7 +495,7 @@ static gsf_result render_frame(scene_run* run, const gsf_splats* splats, int kin
         result = gsfix_save_npy(ctx, at_out(run, frame_file(run, kind, k, frame, GSFIX_DEPTH)).s, &out.depth);
     }
     if (result == GSF_OK) result = gsf_splat_load_view_image(ctx, &run->scene, view);
-    if (result == GSF_OK) result = gsf_measure_psnr(ctx, color, &run->scene.views[view].image, NULL, psnr);
+    if (result == GSF_OK) result = gsf_measure_image(ctx, GSF_METRIC_PSNR, color, &run->scene.views[view].image, NULL, psnr);
     drop_photo(run, view);
     gsf_destroy_image(ctx, &out.depth);
     return result;

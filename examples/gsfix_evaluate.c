@@ -615,7 +615,7 @@ static gsf_result eval_restore_sequence(eval_job* job, const eval_sequences* s, 
     }
     if (result == GSF_OK) result = gsfix_save_images(ctx, paths, c.out_color, q->frame_count);
     if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
-    gsfix_destroy_restorer(app, &restorer);
+    gsf_destroy_restorer(&app->ctx, &restorer);
     gsfix_free_clip(app, &c);
     gsf_free(ctx, paths);
     return result;

@@ -262,6 +262,13 @@ static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_w
     return gsf_fail(ctx, result, "%.300s (kept: %s)", why, e->job);
 }
 
+static void exec_destroy(void* user, gsf_context* ctx) {
+    exec_state* e = (exec_state*)user;
+    end_group(e);
+    gsf_free(ctx, e->command);
+    gsf_free(ctx, e);
+}
+
 gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, gsf_restorer* out) {
     gsf_context* ctx = &app->ctx;
     memset(out, 0, sizeof *out);
@@ -277,16 +284,8 @@ gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, 
     out->begin_fn = exec_begin;
     out->restore_fn = exec_restore;
     out->end_fn = exec_end;
+    out->destroy_fn = exec_destroy;
     if (e->command) return GSF_OK;
-    gsfix_destroy_exec(ctx, out);
+    gsf_destroy_restorer(ctx, out);
     return GSF_ERROR_OUT_OF_MEMORY;
-}
-
-void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer) {
-    exec_state* e = (exec_state*)restorer->user;
-    if (!e) return;
-    end_group(e);
-    gsf_free(ctx, e->command);
-    gsf_free(ctx, e);
-    memset(restorer, 0, sizeof *restorer);
 }

@@ -232,8 +232,8 @@ static gsf_result score_pixels(fix_run* run, const gsf_image* color, const gsf_i
     *psnr = NAN;
     if (ssim) *ssim = NAN;
     if (mask && !gsfix_counts_any(mask)) return GSF_OK;
-    gsf_result result = gsf_measure_psnr(run->ctx, color, photo, mask, psnr);
-    if (result == GSF_OK && ssim) result = gsf_measure_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, ssim);
+    gsf_result result = gsf_measure_image(run->ctx, GSF_METRIC_PSNR, color, photo, mask, psnr);
+    if (result == GSF_OK && ssim) result = gsf_measure_image(run->ctx, GSF_METRIC_SSIM_3DGS, color, photo, mask, ssim);
     return result;
 }
 
@@ -1245,7 +1245,7 @@ static gsf_result finish(fix_run* run) {
 static void free_run(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_splat_destroy_fixer(ctx, run->fixer);
-    gsfix_destroy_restorer(run->app, &run->restorer);
+    gsf_destroy_restorer(run->ctx, &run->restorer);
     gsf_splat_destroy(ctx, &run->initial);
     for (size_t i = 0; run->masks && i < run->split.test_count; i++) gsf_destroy_image(ctx, run->masks + i);
     gsf_free(ctx, run->masks);

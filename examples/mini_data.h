@@ -142,7 +142,7 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
                            data_probe* p) {
     static const size_t views_of[6] = {3, 3, 4, 5, 6, 9};
     const uint64_t seed = o->seed;
-    gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};
+    gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end, NULL};
     uint32_t train[DATA_VIEWS], test[DATA_VIEWS];
     size_t count, held_out;
     gsf_scene scene;

@@ -95,7 +95,7 @@ static double plain_ssim_skimage(const gsf_image* a, const gsf_image* b, const g
 }
 
 // The 3DGS SSIM with its full 11x11 window, zeros outside. The window is the outer product of two float32 rows,
-// rounded to float32 again; gsf_measure_ssim applies the two rows separately, with the same sum.
+// rounded to float32 again; gsf_measure_image applies the two rows separately, with the same sum.
 static double plain_ssim_3dgs(const gsf_image* a, const gsf_image* b, const gsf_image* mask) {
     // float32 of exp(-x^2/4.5) / sum, the sum taken in torch's order
     static const float kernel[11] = {0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f,
@@ -153,33 +153,33 @@ static void check_pair(gsf_context* ctx, const gsf_json* json, const gsf_json_va
     const double psnr = number_or_inf(json, e, "psnr"), tg = number_or_inf(json, e, "ssim_3dgs");
     // The references read the photo as float32, so on the f32 images only rounding differs; the u8 images represent the
     // exact v/255, which moves a PSNR by up to 1e-6 dB.
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &psnr, 1, 1e-9);
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &psnr, 1, 2e-6);
     CHECK_NEAR(got, number_or_inf(json, e, "psnr_torchmetrics"), 1e-4);
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->a, &p->fb, NULL, &got));
     if (isinf(psnr)) CHECK(got > 140.0); // u8 against its own float32 rounding
     else test_compare(name, &got, &psnr, 1, 2e-6);
 
     const double l1 = number_or_inf(json, e, "l1");
-    CHECK_OK(ctx, gsf_measure_difference(ctx, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_DIFFERENCE, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &l1, 1, 1e-7);
 
     const double plain = plain_ssim_3dgs(&p->fa, &p->fb, NULL);
     test_compare(name, &plain, &tg, 1, 1e-9);
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_3DGS, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &tg, 1, 1e-8);
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_3DGS, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &tg, 1, 2e-7);
 
     const double tm = number_or_inf(json, e, "ssim_torchmetrics");
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_TORCHMETRICS, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &tm, 1, 1e-11);
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_TORCHMETRICS, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &tm, 1, 1e-7);
 
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_SKIMAGE, &p->a, &p->b, NULL, &got));
     const double sk = plain_ssim_skimage(&p->a, &p->b, NULL);
     test_compare(name, &got, &sk, 1, 1e-12);
     for (size_t i = 0; i < sizeof skimage / sizeof *skimage; i++)
@@ -192,15 +192,15 @@ static void check_masks(gsf_context* ctx, const pair* p) {
     uint64_t seed = 7;
     gsf_image mask = gsf_wrap_image(bytes, GSF_U8, p->a.width, p->a.height, 1);
     double got = NAN, all = NAN;
-    for (int kind = 0; kind < 3; kind++) {
+    for (int kind = GSF_METRIC_SSIM_3DGS; kind <= GSF_METRIC_SSIM_SKIMAGE; kind++) {
         memset(bytes, 1, n);
-        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got));
-        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, NULL, &all));
+        CHECK_OK(ctx, gsf_measure_image(ctx, (gsf_metric)kind, &p->a, &p->b, &mask, &got));
+        CHECK_OK(ctx, gsf_measure_image(ctx, (gsf_metric)kind, &p->a, &p->b, NULL, &all));
         CHECK(got == all);
         memset(bytes, 0, n);
-        bytes[0] = kind != GSF_SSIM_SKIMAGE; // no window of scikit-image fits at the corner
-        CHECK_RESULT(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got),
-                     kind == GSF_SSIM_SKIMAGE ? GSF_ERROR_DEGENERATE : GSF_OK);
+        bytes[0] = kind != GSF_METRIC_SSIM_SKIMAGE; // no window of scikit-image fits at the corner
+        CHECK_RESULT(ctx, gsf_measure_image(ctx, (gsf_metric)kind, &p->a, &p->b, &mask, &got),
+                     kind == GSF_METRIC_SSIM_SKIMAGE ? GSF_ERROR_DEGENERATE : GSF_OK);
     }
     double sum = 0.0, counted = 0.0;
     for (size_t i = 0; i < n; i++) {
@@ -212,16 +212,16 @@ static void check_masks(gsf_context* ctx, const pair* p) {
             counted += 1.0;
         }
     }
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, 20.0 * log10(1.0 / sqrt(sum / counted)), 1e-10);
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_SKIMAGE, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, plain_ssim_skimage(&p->a, &p->b, &mask), 1e-12);
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_3DGS, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, plain_ssim_3dgs(&p->a, &p->b, &mask), 1e-7);
     memset(bytes, 0, n);
-    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->a, &p->b, &mask, &got), GSF_ERROR_DEGENERATE);
     mask.dtype = GSF_F32;
-    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p->a, &p->b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
     free(bytes);
 }
 
@@ -244,31 +244,28 @@ static void check_determinism(gsf_context* ctx) {
     scalar.cpu_level = GSF_CPU_SCALAR;
     CHECK_OK(&scalar, gsf_init_context(&scalar));
     double one = 0, three = 1, plain = 2;
-    for (int kind = 0; kind <= GSF_SSIM_MULTISCALE_TORCHMETRICS; kind++) {
-        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &x, &y, NULL, &one));
-        CHECK_OK(&other, gsf_measure_ssim(&other, (gsf_ssim_kind)kind, &x, &y, NULL, &three));
-        CHECK_OK(&scalar, gsf_measure_ssim(&scalar, (gsf_ssim_kind)kind, &x, &y, NULL, &plain));
+    for (int kind = 0; kind <= GSF_METRIC_MS_SSIM_TORCHMETRICS; kind++) {
+        CHECK_OK(ctx, gsf_measure_image(ctx, (gsf_metric)kind, &x, &y, NULL, &one));
+        CHECK_OK(&other, gsf_measure_image(&other, (gsf_metric)kind, &x, &y, NULL, &three));
+        CHECK_OK(&scalar, gsf_measure_image(&scalar, (gsf_metric)kind, &x, &y, NULL, &plain));
         CHECK(one == three);
         CHECK(one == plain);
     }
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one));
-    CHECK_OK(&other, gsf_measure_psnr(&other, &x, &y, NULL, &three));
-    CHECK(one == three);
     a[777] = NAN;
-    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_3DGS, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
     a[777] = INFINITY;
-    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
     gsf_image narrow = x;
     narrow.width--;
-    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &narrow, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)9, &y, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &narrow, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, (gsf_metric)9, &y, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
     gsf_image tiny = y;
     tiny.width = 5;
-    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_TORCHMETRICS, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_SKIMAGE, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
     tiny.width = tiny.height = 1;
-    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &tiny, &tiny, NULL, &one));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_SSIM_3DGS, &tiny, &tiny, NULL, &one));
     CHECK(one == 1.0);
 }
 
@@ -294,16 +291,16 @@ static void check_multiscale(gsf_context* ctx) {
             bytes[3 * h * w + at] = (uint8_t)(changed < 0 ? 0 : changed > 255 ? 255 : changed);
         }
         for (int kind = 0; kind < 2; kind++) {
-            const gsf_ssim_kind k = kind ? GSF_SSIM_MULTISCALE_TORCHMETRICS : GSF_SSIM_MULTISCALE;
+            const gsf_metric k = kind ? GSF_METRIC_MS_SSIM_TORCHMETRICS : GSF_METRIC_MS_SSIM;
             double got = 0.0;
-            CHECK_OK(ctx, gsf_measure_ssim(ctx, k, &a, &b, NULL, &got));
+            CHECK_OK(ctx, gsf_measure_image(ctx, k, &a, &b, NULL, &got));
             CHECK_NEAR(got, sizes[i].expected[kind], 1e-7);
-            CHECK_OK(ctx, gsf_measure_ssim(ctx, k, &a, &a, NULL, &got));
+            CHECK_OK(ctx, gsf_measure_image(ctx, k, &a, &a, NULL, &got));
             CHECK_NEAR(got, 1.0, 1e-12);
             gsf_image small = a, mask = gsf_wrap_image(bytes, GSF_U8, w, h, 1);
             small.height = kind ? 175 : 160;
-            CHECK_RESULT(ctx, gsf_measure_ssim(ctx, k, &small, &small, NULL, &got), GSF_ERROR_DEGENERATE);
-            CHECK_RESULT(ctx, gsf_measure_ssim(ctx, k, &a, &b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
+            CHECK_RESULT(ctx, gsf_measure_image(ctx, k, &small, &small, NULL, &got), GSF_ERROR_DEGENERATE);
+            CHECK_RESULT(ctx, gsf_measure_image(ctx, k, &a, &b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
         }
         free(bytes);
     }
@@ -330,7 +327,7 @@ static void check_flickering(gsf_context* ctx) {
             const gsf_image a = gsf_wrap_image(bytes + k * frame, GSF_U8, (int64_t)t.dim[2], (int64_t)t.dim[1],
                                                (int32_t)t.dim[3]);
             const gsf_image b = gsf_wrap_image(bytes + (k + 1) * frame, GSF_U8, a.width, a.height, a.channels);
-            CHECK_OK(ctx, gsf_measure_difference(ctx, &a, &b, NULL, &now));
+            CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_DIFFERENCE, &a, &b, NULL, &now));
             sum += now;
         }
         CHECK_NEAR(1.0 - sum / (double)(t.dim[0] - 1), json.values[i].number, 1e-6); // the reference averages in float32

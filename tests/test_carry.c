@@ -179,7 +179,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
 }
 
 static void probe_init(probe* p, const shots* c, int judges) {
-    const gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};
+    const gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end, NULL};
     memset(p, 0, sizeof *p);
     p->restorer = restorer;
     p->c = c;

@@ -120,7 +120,7 @@ static void test_warp(gsf_context* ctx) {
     warp.end_fn(warp.user, ctx);
     references[1].depth.data = NULL;
     CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 2), GSF_ERROR_INVALID_ARGUMENT);
-    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_destroy_restorer(ctx, &warp);
 }
 
 // References with renders. The splats here show the plane without its green, and the frame's exposure is 0.1 brighter.
@@ -183,7 +183,7 @@ static void test_warp_residual(gsf_context* ctx) {
         CHECK_NEAR(out_color[3 * i + 1], render[3][3 * i + 1], 0.1);
     }
     warp.end_fn(warp.user, ctx);
-    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_destroy_restorer(ctx, &warp);
 }
 
 // 8-bit photos are kept as bytes. One other value per photo, and they are kept as floats: bit-identical frames elsewhere.
@@ -225,7 +225,7 @@ static void test_warp_bytes(gsf_context* ctx) {
         CHECK(differ <= (known < 0 ? 8 : 1) && covered > N * 9 / 10);
         if (known == 0) CHECK(memcmp(out_color[0], color[0], sizeof color[0]) == 0 && differ == 1);
     }
-    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_destroy_restorer(ctx, &warp);
 }
 
 // A splat in front of the plane that neither photo shows: the frame takes the plane behind it from the photos, with full
@@ -281,7 +281,7 @@ static void test_warp_refutes(gsf_context* ctx) {
         for (int x = 40; x < 56; x++) changed += fabsf(out_color[3 * (y * W + x)] - 0.25f) > 1e-6f;
     CHECK(changed == 0);
     warp.end_fn(warp.user, ctx);
-    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_destroy_restorer(ctx, &warp);
 }
 
 // ---- a small scene to repair ---------------------------------------------------
@@ -1058,7 +1058,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
     desc.skip_psnr = 22.0f; // two of the four windows agree and are skipped, in each of the two rounds
     for (int i = 0; i < 3; i++) { // a wrapper that reports `explains`; one that does not; warp itself
         wrapped* w = all + i;
-        const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end};
+        const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end, NULL};
         const gsf_restorer* used = i == 2 ? &w->warp : &outer[i];
         outer[i] = host;
         CHECK_OK(ctx, gsf_splat_make_warp(ctx, &w->warp));
@@ -1073,7 +1073,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
     }
     for (int i = 0; i < 3; i++) {
         gsf_splat_destroy_fixer(ctx, fixers[i]);
-        gsf_splat_destroy_warp(ctx, &all[i].warp);
+        gsf_destroy_restorer(ctx, &all[i].warp);
     }
     memset(&r.start, 0, sizeof r.start); // shares the arrays of r.truth
     repair_teardown(ctx, &r);

@@ -135,9 +135,8 @@ static gsf_result use_everything(gsf_context* ctx, const char* png, const char* 
     if (result == GSF_OK) result = gsf_resize_image(ctx, &image, GSF_RESIZE_PIL_LANCZOS, &small);
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, 20, 10, 3, &packed);
     if (result == GSF_OK) result = gsf_convert_image(ctx, &small, &packed);
-    if (result == GSF_OK) result = gsf_measure_psnr(ctx, &small, &packed, NULL, &value);
-    for (int kind = 0; kind < 3 && result == GSF_OK; kind++)
-        result = gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &small, &packed, NULL, &value);
+    for (int kind = GSF_METRIC_PSNR; kind <= GSF_METRIC_SSIM_SKIMAGE && result == GSF_OK; kind++)
+        result = gsf_measure_image(ctx, (gsf_metric)kind, &small, &packed, NULL, &value);
     if (result == GSF_OK) result = gsf_save_image(ctx, png, &packed);
     if (result == GSF_OK) result = gsf_encode_image(ctx, &small, ".jpg", &text);
     if (result == GSF_OK) result = gsf_parse_json(ctx, "object", object, sizeof object - 1, &json);
@@ -560,7 +559,7 @@ static void test_image_files(gsf_context* ctx) {
             CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, 37, 23, back.channels, &rgb));
             CHECK_OK(ctx, gsf_convert_image(ctx, &image, &rgb));
             double psnr = 0.0;
-            CHECK_OK(ctx, gsf_measure_psnr(ctx, &rgb, &back, NULL, &psnr));
+            CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &rgb, &back, NULL, &psnr));
             CHECK(psnr > 28.0 && psnr < 100.0);
             gsf_destroy_image(ctx, &rgb);
             gsf_destroy_image(ctx, &back);

@@ -426,7 +426,7 @@ static void check_runs(gsf_context* ctx) {
     snprintf(path[1], sizeof path[1], "%s", inside(&model, "features.safetensors"));
     desc.model = path[0];
     for (int i = 0; i < 2; i++, desc.features = path[1]) // with the encoders, then with their precomputed features
-        if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_nn_destroy_dit(ctx, &restorer);
+        if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_destroy_restorer(ctx, &restorer);
 }
 
 // ---- errors ----------------------------------------------------------------------------

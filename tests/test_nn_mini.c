@@ -457,7 +457,7 @@ static void test_restorer(gsf_context* ctx) {
     for (int i = 0; i < 3 * PIXELS; i++) CHECK(c.out[i] >= 0.0f && c.out[i] <= 1.0f && fabsf(c.out[i] - c.color[i]) < 0.025f);
     for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)c.weight[i], 0.05 * 0.05 / (0.05 * 0.05 + exp(-6.0)), 1e-6); // b = e^-3
     run_restorer(ctx, &mini, &c, GSF_ERROR_UNSUPPORTED, 0);
-    gsf_nn_destroy_mini(ctx, &mini);
+    gsf_destroy_restorer(ctx, &mini);
     CHECK_OK(ctx, gsf_read_file(ctx, made_path(), &bytes, &size));
     memset(&desc, 0, sizeof desc);
     desc.data = bytes;
@@ -465,7 +465,7 @@ static void test_restorer(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_nn_make_mini(ctx, &desc, &mini));
     run_restorer(ctx, &mini, &from_memory, GSF_OK, 1);
     CHECK(memcmp(c.out, from_memory.out, sizeof c.out) == 0 && memcmp(c.weight, from_memory.weight, sizeof c.weight) == 0);
-    gsf_nn_destroy_mini(ctx, &mini);
+    gsf_destroy_restorer(ctx, &mini);
     desc.references = GSF__MINI_MOST + 1;
     CHECK_RESULT(ctx, gsf_nn_make_mini(ctx, &desc, &mini), GSF_ERROR_INVALID_ARGUMENT);
     desc.references = 0;
@@ -498,7 +498,7 @@ static void test_restorer(gsf_context* ctx) {
         CHECK_RESULT(ctx, gsf_nn_make_mini(ctx, &desc, &mini),
                      fault == 4 ? GSF_OK : fault == 3 ? GSF_ERROR_UNSUPPORTED : GSF_ERROR_FORMAT);
         if (fault == 4) run_restorer(ctx, &mini, &c, GSF_ERROR_NUMERIC, 1);
-        gsf_nn_destroy_mini(ctx, &mini);
+        gsf_destroy_restorer(ctx, &mini);
     }
     free(tensors);
     gsf__mini_close(ctx, &net);
@@ -531,7 +531,7 @@ static void test_memory(void) {
         memset(&run, 0, sizeof run);
         desc.path = made_path();
         gsf_result result = gsf_nn_make_mini(&ctx, &desc, &mini);
-        gsf_nn_destroy_mini(&ctx, &mini);
+        gsf_destroy_restorer(&ctx, &mini);
         if (!result) result = gsf__mini_open(&ctx, made_path(), NULL, 0, &net);
         else memset(&net, 0, sizeof net);
         if (!result) result = gsf__nn_make_params(&ctx, &net.weights, NULL, 1, &params);

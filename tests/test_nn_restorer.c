@@ -91,7 +91,7 @@ static uint32_t restore(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c, 
     CHECK_OK(ctx, r.begin_fn(r.user, ctx, NULL, 0));
     const int ok = CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), wanted) && wanted == GSF_OK;
     r.end_fn(r.user, ctx);
-    gsf_nn_destroy_dit(ctx, &r);
+    gsf_destroy_restorer(ctx, &r);
     return ok ? checksum(c) : 0;
 }
 
@@ -127,8 +127,8 @@ static void test_limits(gsf_context* ctx, const char* features, clip* c) {
     c->window.frame_count = 8;
     CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_UNSUPPORTED);
     c->window.frame_count = c->frames;
-    gsf_nn_destroy_dit(ctx, &r);
-    gsf_nn_destroy_dit(ctx, &r); // destroying twice is allowed
+    gsf_destroy_restorer(ctx, &r);
+    gsf_destroy_restorer(ctx, &r); // destroying twice is allowed
 }
 
 // A frame at the view of a reference is replaced by the photo.
@@ -154,7 +154,7 @@ static void test_references(gsf_context* ctx, const char* features, clip* c) {
     CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
     c->color[0] = first;
     CHECK(with_photo != plain && with_photo == checksum(c));
-    gsf_nn_destroy_dit(ctx, &r);
+    gsf_destroy_restorer(ctx, &r);
 }
 
 // Compares the restored clip whose first frame is the view of `photo` as `camera` sees it (NULL: the whole photo) with
@@ -221,7 +221,7 @@ static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
     gsf_destroy_image(ctx, &photo.color);
     gsf_destroy_image(ctx, &bytes);
     gsf_destroy_image(ctx, &seen);
-    gsf_nn_destroy_dit(ctx, &r);
+    gsf_destroy_restorer(ctx, &r);
 }
 
 // Every condition gives a different result; disabling the cache of the references' keys changes no bit.
@@ -384,7 +384,7 @@ static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* ne
         r.end_fn(r.user, ctx);
     }
     for (int i = 0; i < PHOTOS; i++) CHECK(seen[i] > 0);
-    gsf_nn_destroy_dit(ctx, &r);
+    gsf_destroy_restorer(ctx, &r);
 }
 
 // Checksums of three clips, each between different photos, from a restorer made from this desc; zero where an error is
@@ -413,7 +413,7 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
     CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "vggt_latents.photo0,3") != NULL);
     r.end_fn(r.user, ctx);
-    gsf_nn_destroy_dit(ctx, &r);
+    gsf_destroy_restorer(ctx, &r);
     c->window.cameras = NULL;
     c->window.clip = 0;
 }
@@ -479,7 +479,7 @@ static void test_clips(gsf_context* ctx, clip* c, const gsf_nn_transformer* net)
         CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
         CHECK(strstr(ctx->error, "prompt_embeds.clip1") != NULL);
         c->window.clip = 0;
-        gsf_nn_destroy_dit(ctx, &r);
+        gsf_destroy_restorer(ctx, &r);
     }
 }
 
@@ -768,7 +768,7 @@ static void test_memory(const char* features, clip* c) {
         count.fail_at = k;
         gsf_result result = gsf_nn_make_dit(&ctx, &desc, &r);
         if (!result) result = r.restore_fn(r.user, &ctx, &c->window);
-        gsf_nn_destroy_dit(&ctx, &r);
+        gsf_destroy_restorer(&ctx, &r);
         CHECK(count.live == 0);
         if (!result) { CHECK(count.calls < k); break; }
         if (!CHECK(result == GSF_ERROR_OUT_OF_MEMORY)) break;

@@ -1,5 +1,5 @@
 // The OpenImageIO section: round trips of EXR, TIFF and 16-bit PNG through files and memory; and OpenImageIO as an
-// oracle for our decoder, gsf_measure_psnr and half precision.
+// oracle for our decoder, gsf_measure_image and half precision.
 #define GSF_USE_OIIO
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
@@ -134,7 +134,7 @@ static void check_half(uint64_t* seed) {
     }
 }
 
-// Same photo through OpenImageIO and through us; PSNR by ImageBufAlgo::compare and by gsf_measure_psnr.
+// Same photo through OpenImageIO and through us; PSNR by ImageBufAlgo::compare and by gsf_measure_image.
 static void check_oracle(gsf_context* ctx) {
     static const char* const names[] = {"landscape.png", "wide.png", "small.png", "large.png"};
     for (int k = 0; k < 4; k++) {
@@ -164,7 +164,7 @@ static void check_oracle(gsf_context* ctx) {
         const OIIO::ImageBufAlgo::CompareResults judged = OIIO::ImageBufAlgo::compare(x, y, 1e-3f, 1e-4f);
         const gsf_image p = gsf_wrap_image(a.data(), GSF_F32, W, H, 3), q = gsf_wrap_image(b.data(), GSF_F32, W, H, 3);
         double psnr = 0;
-        CHECK_OK(ctx, gsf_measure_psnr(ctx, &p, &q, NULL, &psnr));
+        CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &p, &q, NULL, &psnr));
         // their peak is the largest value of the image, not 1
         float peak = 0.0f;
         for (size_t i = 0; i < a.size(); i++) peak = fmaxf(peak, fmaxf(fabsf(a[i]), fabsf(b[i])));

@@ -231,7 +231,7 @@ static gsf_result run(loop* l) {
     gsf_splat_destroy(&l->ctx, &l->start);
     if (l->fixer) gsf_splat_destroy_fixer(&l->ctx, l->fixer);
     if (l->resumed) gsf_splat_destroy_fixer(&l->ctx, l->resumed);
-    gsf_splat_destroy_warp(&l->ctx, &l->warp);
+    gsf_destroy_restorer(&l->ctx, &l->warp);
     gsf_splat_destroy_dense(&l->ctx, &l->dense);
     gsf_splat_destroy_scene(&l->ctx, &l->scene);
     return result;

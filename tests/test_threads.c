@@ -83,14 +83,14 @@ static void run_images(gsf_context* ctx, run_output* run) {
 
     out = begin_stage(run, "metrics");
     double value;
-    CHECK_OK(ctx, gsf_measure_psnr(ctx, &image_a, &image_b, NULL, &value));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_PSNR, &image_a, &image_b, NULL, &value));
     add(out, &value, sizeof value);
-    const gsf_ssim_kind kinds[3] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
+    const gsf_metric kinds[3] = {GSF_METRIC_SSIM_3DGS, GSF_METRIC_SSIM_TORCHMETRICS, GSF_METRIC_SSIM_SKIMAGE};
     for (int i = 0; i < 3; i++) {
-        CHECK_OK(ctx, gsf_measure_ssim(ctx, kinds[i], &image_a, &image_b, NULL, &value));
+        CHECK_OK(ctx, gsf_measure_image(ctx, kinds[i], &image_a, &image_b, NULL, &value));
         add(out, &value, sizeof value);
     }
-    CHECK_OK(ctx, gsf_measure_difference(ctx, &image_a, &image_b, NULL, &value));
+    CHECK_OK(ctx, gsf_measure_image(ctx, GSF_METRIC_DIFFERENCE, &image_a, &image_b, NULL, &value));
     add(out, &value, sizeof value);
     free(a);
     free(b);
@@ -302,7 +302,7 @@ static void run_repair(gsf_context* ctx, run_output* run) {
         add_splats(out, gsf_splat_get_trained(gsf_splat_get_trainer(fixer)));
         gsf_splat_destroy_fixer(ctx, fixer);
     }
-    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_destroy_restorer(ctx, &warp);
     gsf_splat_destroy(ctx, &start);
     free(pixels);
 }
