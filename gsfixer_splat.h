@@ -9692,12 +9692,16 @@ GSF__V_KERNEL uint32_t GSF__V(gsf__adam_update)(float* value, float* m, float* v
                                                 size_t n, const float* rates, size_t period, float inv_correction2) {
     uint32_t rejected = 0;
     for (size_t row = 0; row < rows; row++) {
-        size_t i = row * stride, r = 0;
-        const size_t end = i + n;
-        for (; i + GSF__LANES <= end; i += GSF__LANES, r = r + GSF__LANES == period ? 0 : r + GSF__LANES)
-            rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rates + r, inv_correction2, GSF__LANES);
-        if (i < end)
-            rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rates + r, inv_correction2, end - i);
+        const size_t end = row * stride + n;
+        for (size_t first = row * stride; first < end; first += period) {
+            const size_t stop = end - first < period ? end : first + period;
+            const float* rate = rates;
+            size_t i = first;
+            for (; i + GSF__LANES <= stop; i += GSF__LANES, rate += GSF__LANES)
+                rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rate, inv_correction2, GSF__LANES);
+            if (i < stop)
+                rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rate, inv_correction2, stop - i);
+        }
     }
     return rejected;
 }
