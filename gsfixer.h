@@ -318,7 +318,7 @@ GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const 
 // ---- images --------------------------------------------------------------------
 
 typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dtype;
-// A label: pixels are converted only where a function's comment says so.
+// A label: pixels are converted only where a function's comment says so. sRGB is IEC 61966-2-1, extended above 1.
 typedef enum gsf_color_space { GSF_COLOR_SRGB = 0, GSF_COLOR_LINEAR } gsf_color_space;
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
@@ -340,8 +340,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtyp
                                                 int32_t channels, gsf_image* out);
 GSF_API void gsf_destroy_image(gsf_context* ctx, gsf_image* image);
 
-// Copies pixels between dtypes and layouts. u8 to float divides by 255; float to u8 is clamp(x*255 + 0.5) truncated
-// (torchvision save_image); NaN becomes 0. 1 channel is replicated to 3; 4 to 3 drops alpha; other counts are an error.
+// Copies pixels between dtypes, layouts and color spaces (where the labels differ, alpha, the last of 2 or 4 channels, is
+// kept). u8 to float divides by 255; float to u8 is clamp(x*255 + 0.5) truncated (torchvision save_image); NaN becomes 0.
+// 1 channel is replicated to 3; 4 to 3 drops alpha; other counts are an error. src and dst may be the same pixels.
 GSF_API GSF_NODISCARD gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, const gsf_image* dst);
 
 // Reads PNG, JPEG, BMP, TGA, PNM (stb) and, with GSF_USE_OIIO, whatever OpenImageIO reads. channels: 1, 3, 4 or
@@ -354,7 +355,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_decode_image(gsf_context* ctx, const char* 
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
-// Writes by extension: .png (u8, from any dtype), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32),
+// Writes by extension: .png (u8 in sRGB, from any dtype and color space), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32),
 // .tif (dtype kept, f16 as f32) and u16 images as 16-bit .png.
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
 // PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
@@ -3042,6 +3043,16 @@ static void gsf__store_pixels(char* p, int64_t stride, gsf_dtype dtype, size_t n
     }
 }
 
+// The sRGB transfer function and its inverse; linear below 0.
+GSF__SHARED void gsf__transfer_colors(double* values, size_t count, gsf_color_space to) {
+    if (to == GSF_COLOR_SRGB)
+        for (size_t i = 0; i < count; i++)
+            values[i] = values[i] <= 0.0031308 ? 12.92 * values[i] : 1.055 * pow(values[i], 1.0 / 2.4) - 0.055;
+    else
+        for (size_t i = 0; i < count; i++)
+            values[i] = values[i] <= 0.04045 ? values[i] / 12.92 : pow((values[i] + 0.055) / 1.055, 2.4);
+}
+
 enum { GSF__CONVERT_RUN = 256 };
 
 typedef struct gsf__convert_job {
@@ -3055,8 +3066,10 @@ static void gsf__convert_rows(void* arg, size_t chunk, int32_t worker) {
     const int in_float = src->dtype == GSF_F16 || src->dtype == GSF_F32;
     const gsf__rows rows = gsf__chunk_rows(dst, chunk);
     double run[GSF__CONVERT_RUN];
+    const int transfer = src->color_space != dst->color_space;
     for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < dst->channels; c++) {
+            const int alpha = dst->channels % 2 == 0 && c == dst->channels - 1;
             const char* from =
                 (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
             char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
@@ -3064,6 +3077,7 @@ static void gsf__convert_rows(void* arg, size_t chunk, int32_t worker) {
                 const int64_t left = dst->width - x;
                 const size_t n = left < GSF__CONVERT_RUN ? (size_t)left : (size_t)GSF__CONVERT_RUN;
                 gsf__load_pixels(from + x * src->stride_x, src->stride_x, src->dtype, n, run);
+                if (transfer && !alpha) gsf__transfer_colors(run, n, dst->color_space);
                 gsf__store_pixels(to + x * dst->stride_x, dst->stride_x, dst->dtype, n, run, in_float);
             }
         }
@@ -4331,6 +4345,7 @@ static gsf_result gsf__ms_ssim(gsf_context* ctx, gsf_metric kind, const gsf_imag
     for (size_t i = 0; products && i < groups; i++) products[i] = 1.0;
     for (int i = 0; i < 2 && result == GSF_OK; i++) {
         result = gsf_make_image(ctx, GSF_F32, a->width, a->height, a->channels, &pair[i]);
+        pair[i].color_space = (i ? b : a)->color_space;
         if (result == GSF_OK) result = gsf_convert_image(ctx, i ? b : a, &pair[i]);
     }
     for (int scale = 0; scale < GSF__SSIM_SCALES && result == GSF_OK; scale++) {
@@ -4968,6 +4983,7 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
                               OIIO::geterror());
     gsf_image packed;
     GSF__TRY(gsf_make_image(ctx, dtype, image->width, image->height, image->channels, &packed));
+    packed.color_space = image->color_space;
     gsf_result result = gsf_convert_image(ctx, image, &packed);
     std::vector<unsigned char> bytes;
     if (result == GSF_OK) {

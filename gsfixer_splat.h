@@ -3740,7 +3740,8 @@ static gsf_result gsf__view_weight(gsf_context* ctx, const gsf_image* photo, con
     const size_t pixels = (size_t)photo->width * (size_t)photo->height;
     gsf_result result = GSF_OK;
     if (has_alpha) {
-        const gsf_image alpha = gsf__channels_of(photo, photo->channels - 1, 1);
+        gsf_image alpha = gsf__channels_of(photo, photo->channels - 1, 1);
+        alpha.color_space = GSF_COLOR_SRGB; // not a color: no conversion
         result = gsf_convert_image(ctx, &alpha, out);
     } else {
         memset(w, 255, pixels);
@@ -3815,28 +3816,6 @@ static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r,
     return GSF_OK;
 }
 
-// The sRGB transfer function (IEC 61966-2-1), extended above 1; linear below 0.
-static void gsf__encode_srgb(float* values, size_t count) {
-    for (size_t i = 0; i < count; i++) {
-        const float v = values[i];
-        values[i] = v <= 0.0031308f ? 12.92f * v : 1.055f * powf(v, 1.0f / 2.4f) - 0.055f;
-    }
-}
-
-// Converts `colors` to packed u8 RGB; a linear image is encoded as sRGB.
-static gsf_result gsf__photo_bytes(gsf_context* ctx, const gsf_image* colors, const gsf_image* rgb) {
-    if (colors->color_space != GSF_COLOR_LINEAR) return gsf_convert_image(ctx, colors, rgb);
-    gsf_image floats;
-    GSF__TRY(gsf_make_image(ctx, GSF_F32, rgb->width, rgb->height, 3, &floats));
-    gsf_result result = gsf_convert_image(ctx, colors, &floats);
-    if (result == GSF_OK) {
-        gsf__encode_srgb((float*)floats.data, 3 * (size_t)rgb->width * (size_t)rgb->height);
-        result = gsf_convert_image(ctx, &floats, rgb);
-    }
-    gsf_destroy_image(ctx, &floats);
-    return result;
-}
-
 // mask: packed u8 with one channel, of the photo's size; or NULL.
 static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo,
                                 const gsf_image* mask) {
@@ -3848,7 +3827,7 @@ static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view,
     memset(&weight, 0, sizeof weight);
     memset(&joint, 0, sizeof joint);
     gsf_result result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &rgb);
-    if (result == GSF_OK) result = gsf__photo_bytes(ctx, &colors, &rgb);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, &colors, &rgb);
     if (result == GSF_OK && !state->no_masks) result = gsf__view_weight(ctx, photo, mask, &weight);
     const int fits = photo->width == r->lens.width && photo->height == r->lens.height && r->lens.kind == GSF__LENS_PINHOLE;
     if (result == GSF_OK && !weight.data) {
@@ -3918,6 +3897,7 @@ static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_i
                           (long long)photo->height);
         goto cleanup;
     }
+    file.color_space = GSF_COLOR_SRGB; // not a color: no conversion
     result = gsf_make_image(ctx, GSF_U8, file.width, file.height, 1, &bytes);
     if (result == GSF_OK) result = gsf_convert_image(ctx, &file, &bytes);
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 1, out);
@@ -10294,7 +10274,8 @@ static gsf_result gsf__photo_weigh(gsf_context* ctx, const gsf_image* weight, si
     photo->weight = out;
     photo->target.weight = out;
     if (weight->dtype == GSF_U8) {
-        const gsf_image floats = gsf_wrap_image(out, GSF_F32, weight->width, weight->height, 1);
+        gsf_image floats = gsf_wrap_image(out, GSF_F32, weight->width, weight->height, 1);
+        floats.color_space = weight->color_space;
         GSF__TRY(gsf_convert_image(ctx, weight, &floats));
     } else {
         GSF__TRY(gsf__photo_copy(ctx, weight, "weight of view", index, 0.0f, 1e6f, out));
@@ -10328,13 +10309,14 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     if (!out->pixels) return GSF_ERROR_OUT_OF_MEMORY;
     if (kept == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
     else out->target.f32 = (const float*)out->pixels;
-    if (kept == image->dtype) {
-        GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
-    } else {
-        const gsf_image floats = gsf_wrap_image(out->pixels, GSF_F32, image->width, image->height, 3);
-        GSF__TRY(gsf_convert_image(ctx, image, &floats));
+    gsf_image floats = gsf_wrap_image(out->pixels, GSF_F32, image->width, image->height, 3);
+    floats.color_space = image->color_space;
+    if (kept == image->dtype) GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
+    else GSF__TRY(gsf_convert_image(ctx, image, &floats));
+    if (linear) {
+        const gsf_image encoded = gsf_wrap_image(out->pixels, GSF_F32, image->width, image->height, 3);
+        GSF__TRY(gsf_convert_image(ctx, &floats, &encoded));
     }
-    if (linear) gsf__encode_srgb((float*)out->pixels, 3 * pixels);
     return weight->data ? gsf__photo_weigh(ctx, weight, index, out) : GSF_OK;
 }
 
@@ -10350,13 +10332,16 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
     out->photos = (gsf__photo*)gsf_alloc_zeroed(ctx, count, sizeof *out->photos);
     out->order = (uint32_t*)gsf_alloc(ctx, count, sizeof *out->order);
     gsf_result result = out->photos && out->order ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    size_t linear = 0;
     for (size_t i = 0; result == GSF_OK && i < count; i++) {
         gsf__photo* photo = &out->photos[i];
+        linear += views[i].image.color_space == GSF_COLOR_LINEAR;
         result = gsf__photo_make(ctx, &views[i], what, i, photo);
         if (result != GSF_OK) break;
         if (photo->camera.width > out->max_width) out->max_width = photo->camera.width;
         if (photo->camera.height > out->max_height) out->max_height = photo->camera.height;
     }
+    if (linear) gsf_log(ctx, GSF_LOG_INFO, "trainer: %zu of %zu %ss are linear: encoded as sRGB", linear, count, what);
     if (result != GSF_OK) gsf__photo_set_destroy(ctx, out);
     return result;
 }

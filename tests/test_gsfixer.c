@@ -532,6 +532,31 @@ static gsf_image noise_image(gsf_context* ctx, int64_t width, int64_t height, in
     return image;
 }
 
+// Colors change where the labels differ; alpha does not. There and back gives the same bytes, in place, too.
+static void test_color_spaces(gsf_context* ctx) {
+    enum { N = 256 };
+    static uint8_t bytes[4 * N], again[4 * N];
+    static float linear[4 * N];
+    for (int i = 0; i < 4 * N; i++) bytes[i] = (uint8_t)(i / 4 + i % 4 * 85);
+    const gsf_image from = gsf_wrap_image(bytes, GSF_U8, 16, 16, 4), back = gsf_wrap_image(again, GSF_U8, 16, 16, 4);
+    gsf_image floats = gsf_wrap_image(linear, GSF_F32, 16, 16, 4), srgb = floats;
+    floats.color_space = GSF_COLOR_LINEAR;
+    CHECK_OK(ctx, gsf_convert_image(ctx, &from, &floats));
+    for (int i = 0; i < 4 * N; i++) {
+        const double v = bytes[i] / 255.0, wanted = i % 4 == 3 ? v : v <= 0.04045 ? v / 12.92 : pow((v + 0.055) / 1.055, 2.4);
+        CHECK_NEAR(linear[i], wanted, 1e-7);
+    }
+    CHECK_OK(ctx, gsf_convert_image(ctx, &floats, &back));
+    CHECK(memcmp(bytes, again, sizeof bytes) == 0);
+    CHECK_OK(ctx, gsf_convert_image(ctx, &floats, &srgb));
+    for (int i = 0; i < 4 * N; i++) CHECK_NEAR(linear[i], bytes[i] / 255.0, 1e-6);
+    linear[0] = -0.5f;
+    linear[1] = 4.0f;
+    CHECK_OK(ctx, gsf_convert_image(ctx, &floats, &srgb));
+    CHECK_NEAR(linear[0], -6.46, 1e-6);
+    CHECK_NEAR(linear[1], 1.055 * pow(4.0, 1.0 / 2.4) - 0.055, 1e-6);
+}
+
 static void test_image_files(gsf_context* ctx) {
     for (int32_t channels = 1; channels <= 4; channels++) {
         gsf_image image = noise_image(ctx, 37, 23, channels), back;
@@ -1126,6 +1151,7 @@ int main(void) {
     test_json_text(&ctx);
     test_json_control_characters(&ctx);
     test_conversions(&ctx);
+    test_color_spaces(&ctx);
     test_image_files(&ctx);
     test_damaged_images(&ctx, &h);
     test_image_guards(&ctx);
