@@ -355,8 +355,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_decode_image(gsf_context* ctx, const char* 
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
-// Writes by extension: .png (u8 in sRGB, from any dtype and color space), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32),
-// .tif (dtype kept, f16 as f32) and u16 images as 16-bit .png.
+// Writes by extension: .png (u8 in sRGB, from any dtype and color space), .jpg (the same, quality 95) and, with
+// GSF_USE_OIIO, .exr (f16 or else f32), .tif (dtype kept, f16 as f32) and u16 images as 16-bit .png.
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
 // PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
 GSF_API GSF_NODISCARD gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension,
@@ -714,6 +714,16 @@ GSF__SHARED gsf_result gsf__reserve(gsf_context* ctx, void** array, size_t* capa
     *array = fresh;
     *capacity = grown;
     return GSF_OK;
+}
+
+// The sRGB transfer function and its inverse; linear below 0.
+GSF__SHARED void gsf__transfer_colors(double* values, size_t count, gsf_color_space to) {
+    if (to == GSF_COLOR_SRGB)
+        for (size_t i = 0; i < count; i++)
+            values[i] = values[i] <= 0.0031308 ? 12.92 * values[i] : 1.055 * pow(values[i], 1.0 / 2.4) - 0.055;
+    else
+        for (size_t i = 0; i < count; i++)
+            values[i] = values[i] <= 0.04045 ? values[i] / 12.92 : pow((values[i] + 0.055) / 1.055, 2.4);
 }
 
 // Arrays that are freed together. gsf__arena_alloc returns NULL when out of memory and sets `failed`, so that one check
@@ -3041,16 +3051,6 @@ static void gsf__store_pixels(char* p, int64_t stride, gsf_dtype dtype, size_t n
             for (size_t i = 0; i < n; i++, p += stride) memcpy(p, &in[i], sizeof(double));
             break;
     }
-}
-
-// The sRGB transfer function and its inverse; linear below 0.
-GSF__SHARED void gsf__transfer_colors(double* values, size_t count, gsf_color_space to) {
-    if (to == GSF_COLOR_SRGB)
-        for (size_t i = 0; i < count; i++)
-            values[i] = values[i] <= 0.0031308 ? 12.92 * values[i] : 1.055 * pow(values[i], 1.0 / 2.4) - 0.055;
-    else
-        for (size_t i = 0; i < count; i++)
-            values[i] = values[i] <= 0.04045 ? values[i] / 12.92 : pow((values[i] + 0.055) / 1.055, 2.4);
 }
 
 enum { GSF__CONVERT_RUN = 256 };

@@ -25,7 +25,7 @@
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> if available, else <embree3/rtcore.h>
 
    DATA FLOW
-       photos, COLMAP model or transforms.json                 .ply .splat .spz
+       photos, COLMAP model or transforms.json                 .ply .splat .spz .glb
              | gsf_splat_load_scene                                  ^ gsf_splat_save
              v                                                       | gsf_splat_load
          gsf_scene ---- gsf_splat_make_initial_splats -------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
@@ -150,8 +150,8 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 // unchanged except for the order of splats at equal depth.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
-/* Splat files. The format is chosen by the extension (.ply, .splat, .spz, case-insensitive); files with another
-   extension are recognised by content if they are PLY or SPZ (.splat has no magic number).
+/* Splat files. The format is chosen by the extension (.ply, .splat, .spz, .glb, case-insensitive); files with another
+   extension are recognised by content if they are PLY, SPZ or GLB (.splat has no magic number).
        .ply    The standard 3DGS PLY: columns are found by name; ascii and both endians, float and double are read.
                Origin: zero, or the rounded centre if coordinates are large (centre beyond 1e5 or beyond 1000 times the
                extent; both are medians of samples and so robust against stray splats). A header with more rows than fit
@@ -168,16 +168,23 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* sp
                and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than 2^30 bytes of
                content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under
                GSF_NO_STB.
-   No format stores an origin, so world positions are written. For .splat and .spz, positions whose quantization is coarse
+       .glb    Binary glTF 2.0 with KHR_gaussian_splatting as ratified: floats, 64 (SH degree 0) to 244 bytes per splat,
+               and COLOR_0 for viewers without splats. The origin becomes the node's translation, so that positions keep
+               their precision. Axes are converted to and from glTF's (x and y negated). All primitives of the default
+               scene are read, floats, bytes or shorts; their nodes' rotations, translations and uniform scales are
+               applied (SH coefficients keep their axes, as the extension says). Files of early writers, which hold
+               logarithms of scales, are recognised. GSF_ERROR_UNSUPPORTED: compression, other files' buffers; more than
+               2^32 bytes. GSF_ERROR_DEGENERATE: no splats to write, as glTF has no empty arrays.
+   Only .glb stores an origin; else world positions are written. For .splat and .spz, positions whose quantization is coarse
    relative to the splats (more than a quarter of the median scale) cause a warning and positions out of range an error;
    with `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers.
    Splats with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An
    opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a
    file that claims more content than DEFLATE can compress into it (1032 times its size) is refused in advance. */
-typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
+typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ, GSF_SPLAT_GLB } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
-    gsf_splat_type type;  // AUTO: by the extension, which must then be one of the three
+    gsf_splat_type type;  // AUTO: by the extension, which must then be one of the four
     int32_t local;        // write positions relative to splats->origin, which the file does not store
     int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of
                           // the rotation error (not visible for compact splats). Use 2 for readers from before July 2025
@@ -1618,11 +1625,21 @@ static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gs
 
 static const float gsf__dc_scale = 0.28209479177387814f; // SH band 0: colour = 0.5 + gsf__dc_scale * coefficient
 
+// The signs that SH coefficients get where axes change theirs: those of their polynomials.
+static void gsf__sh_signs(const float axes[3], float signs[16]) {
+    static const uint8_t odd[16] = {0, 2, 4, 1, 3, 6, 0, 5, 0, 2, 7, 2, 4, 1, 4, 1}; // bits: in x, y, z
+    for (size_t k = 0; k < 16; k++) {
+        signs[k] = 1.0f;
+        for (int a = 0; a < 3; a++)
+            if (odd[k] >> a & 1) signs[k] *= axes[a];
+    }
+}
+
 static gsf_splat_type gsf__type_of_name(const char* name) {
-    static const char* const endings[3] = {".ply", ".splat", ".spz"};
-    static const gsf_splat_type types[3] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ};
+    static const char* const endings[4] = {".ply", ".splat", ".spz", ".glb"};
+    static const gsf_splat_type types[4] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ, GSF_SPLAT_GLB};
     const size_t size = strlen(name);
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 4; i++) {
         const size_t n = strlen(endings[i]);
         size_t k = 0;
         if (size < n) continue;
@@ -1842,12 +1859,10 @@ static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const voi
                    9 bits of each other component in units of sqrt(1/2) / 511; the largest is positive
        SH          count x (K - 1) x 3 x u8: 128 + 128 * coefficient, rounded to 5 (band 1) or 4 bits when writing
    SPZ's axes are right, up, back; ours (and PLY's) are right, down, front. So y and z of positions and quaternions
-   change sign, and so do the SH coefficients listed in gsf__spz_signs. */
+   change sign, and some SH coefficients. */
 
 enum { GSF__SPZ_HEAD = 16, GSF__SPZ_ANTIALIASED = 1, GSF__SPZ_EXTENDED = 2, GSF__SPZ_FRACTION_MAX = 23 };
 
-static const float gsf__spz_signs[15] = {-1.0f, -1.0f, 1.0f, -1.0f, 1.0f, 1.0f, -1.0f, 1.0f,
-                                         -1.0f, 1.0f,  -1.0f, -1.0f, 1.0f, -1.0f, 1.0f};
 static const float gsf__spz_axes[3] = {1.0f, -1.0f, -1.0f};
 static const float gsf__spz_color = 0.15f, gsf__sqrt_half = 0.70710678118654752440f;
 
@@ -1977,7 +1992,9 @@ static void gsf__spz_decode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf_splats* s = job->splats;
     const size_t begin = chunk * GSF__CODEC_CHUNK, rotation = gsf__spz_rotation_size(spz->version);
     const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), stored = (size_t)(spz->degree * (spz->degree + 2));
+    float signs[16];
     (void)worker;
+    gsf__sh_signs(gsf__spz_axes, signs);
     for (size_t i = begin; i < gsf__codec_end(s->count, begin); i++) {
         const unsigned char* sh = from->sh + 3 * stored * i;
         double p[3];
@@ -1989,8 +2006,7 @@ static void gsf__spz_decode_chunk(void* arg, size_t chunk, int32_t worker) {
         }
         for (size_t k = 1; k < bands; k++)
             for (size_t c = 0; c < 3; c++)
-                s->sh[3 * (bands * i + k) + c] =
-                    gsf__spz_signs[k - 1] * ((float)sh[3 * (k - 1) + c] - 128.0f) / 128.0f;
+                s->sh[3 * (bands * i + k) + c] = signs[k] * ((float)sh[3 * (k - 1) + c] - 128.0f) / 128.0f;
         gsf__spz_decode_rotation(from->rotations + rotation * i, spz->version, s->quats + 4 * i);
         s->opacity_logits[i] = job->logits[from->alphas[i]];
     }
@@ -2050,7 +2066,9 @@ static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t rotation = gsf__spz_rotation_size(job->version);
     const gsf__spz_arrays* to = &job->arrays;
     const double units = ldexp(1.0, job->fraction);
+    float signs[16];
     (void)worker;
+    gsf__sh_signs(gsf__spz_axes, signs);
     for (size_t row = begin; row < gsf__codec_end(job->count, begin); row++) {
         const size_t i = job->rows[row];
         unsigned char* sh = to->sh + 3 * (bands - 1) * row;
@@ -2065,8 +2083,7 @@ static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         gsf__spz_encode_rotation(s->quats + 4 * i, job->version, to->rotations + rotation * row);
         for (size_t k = 1; k < bands; k++)
             for (size_t c = 0; c < 3; c++)
-                sh[3 * (k - 1) + c] = gsf__spz_encode_sh(gsf__spz_signs[k - 1] * s->sh[3 * (bands * i + k) + c],
-                                                         k < 4 ? 8 : 16);
+                sh[3 * (k - 1) + c] = gsf__spz_encode_sh(signs[k] * s->sh[3 * (bands * i + k) + c], k < 4 ? 8 : 16);
     }
 }
 
@@ -2131,6 +2148,559 @@ static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_
     return result;
 }
 
+// Converts the rotation of a column-major matrix to a unit quaternion w x y z, w >= 0. Divides by the largest component
+// for accuracy.
+static void gsf__quaternion_from_pose(const double m[16], double q[4]) {
+    const double squares[4] = {1 + m[0] + m[5] + m[10], 1 + m[0] - m[5] - m[10], 1 - m[0] + m[5] - m[10],
+                               1 - m[0] - m[5] + m[10]};
+    const double mixed[4][4] = {{squares[0], m[6] - m[9], m[8] - m[2], m[1] - m[4]},
+                                {m[6] - m[9], squares[1], m[1] + m[4], m[8] + m[2]},
+                                {m[8] - m[2], m[1] + m[4], squares[2], m[6] + m[9]},
+                                {m[1] - m[4], m[8] + m[2], m[6] + m[9], squares[3]}};
+    int best = 0;
+    double norm = 0.0;
+    for (int i = 1; i < 4; i++)
+        if (squares[i] > squares[best]) best = i;
+    for (int i = 0; i < 4; i++) q[i] = mixed[best][i], norm += q[i] * q[i];
+    norm = q[0] < 0.0 ? -sqrt(norm) : sqrt(norm);
+    for (int i = 0; i < 4; i++) q[i] /= norm;
+}
+
+/* .glb: binary glTF 2.0 with the extension KHR_gaussian_splatting, as ratified: a header, a chunk of JSON and a chunk of
+   arrays, to which the JSON's accessors point. A primitive of points has the attributes POSITION and, with the extension's
+   name in front, ROTATION (unit, x y z w), SCALE (not its logarithm), OPACITY (not its logit) and SH_DEGREE_l_COEF_n, whose
+   coefficients are those of the PLY. glTF's axes are left, up, forward; so x and y change sign. */
+
+enum {
+    GSF__GLB_HEAD = 12,
+    GSF__GLB_CHUNK = 8,
+    GSF__GLB_DEPTH = 64,  // of nodes in nodes
+    GSF__GLB_POSITION = 0,
+    GSF__GLB_ROTATION,
+    GSF__GLB_SCALE,
+    GSF__GLB_OPACITY,
+    GSF__GLB_SH,  // indices of columns
+    GSF__GLB_COLUMNS = GSF__GLB_SH + 16
+};
+
+static const char gsf__glb_extension[] = "KHR_gaussian_splatting";
+static const float gsf__glb_axes[3] = {-1.0f, -1.0f, 1.0f};
+static const int gsf__glb_sizes[GSF__GLB_SH + 1] = {3, 4, 3, 1, 3};  // components of each column
+
+typedef struct gsf__glb_column {  // an accessor
+    const unsigned char* data;
+    size_t stride;
+    int type, normalized;  // glTF's component type
+} gsf__glb_column;
+
+typedef struct gsf__glb_part {  // a primitive, where a node places it
+    size_t first, count;        // its splats
+    int degree;
+    double matrix[16];  // to the world, in glTF's axes: a rotation times `scale`, and a translation
+    double scale;
+    float quat[4];  // the rotation
+    gsf__glb_column columns[GSF__GLB_COLUMNS];
+} gsf__glb_part;
+
+typedef struct gsf__glb {
+    gsf_context* ctx;
+    const char* name;
+    gsf_json json;
+    const unsigned char* bytes;  // the chunk of arrays
+    size_t byte_count;
+    gsf__glb_part* parts;
+    size_t part_count, part_room, nodes_met;
+    size_t count;
+    int degree;
+    int log_scales, logits;  // files of early writers hold logarithms and logits
+    float signs[16];
+} gsf__glb;
+
+// `at` may be NULL: the error is then about the whole JSON.
+static gsf_result gsf__glb_fail(const gsf__glb* glb, const gsf_json_value* at, const char* what) {
+    const size_t offset = GSF__GLB_HEAD + GSF__GLB_CHUNK + (at ? (size_t)at->offset : 0);
+    return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:%zu: %s", glb->name, offset, what);
+}
+
+static const gsf_json_value* gsf__glb_member(const gsf__glb* glb, const gsf_json_value* object, const char* key) {
+    return gsf_find_json_member(&glb->json, object, key);
+}
+
+// A member that is an integer in [0, most]; `otherwise` if it is missing. A negative `otherwise` makes it required.
+static gsf_result gsf__glb_integer(const gsf__glb* glb, const gsf_json_value* object, const char* key, double most,
+                                   double otherwise, size_t* out) {
+    const gsf_json_value* value = gsf__glb_member(glb, object, key);
+    const double number = value && value->type == GSF_JSON_NUMBER ? value->number : value ? -1.0 : otherwise;
+    if (!(number >= 0.0 && number <= most && number == floor(number)))
+        return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:%zu: \"%s\" is not an integer in 0..%.0f", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)(value ? value : object)->offset, key, most);
+    *out = (size_t)number;
+    return GSF_OK;
+}
+
+// The element of a top-level array that a member of `object` refers to.
+static gsf_result gsf__glb_element(const gsf__glb* glb, const gsf_json_value* object, const char* key, const char* array,
+                                   const gsf_json_value** out) {
+    const gsf_json_value* list = gsf__glb_member(glb, &glb->json.values[0], array);
+    size_t index;
+    if (!list || list->type != GSF_JSON_ARRAY || list->count == 0)
+        return gsf__glb_fail(glb, object, "refers to a missing array");
+    GSF__TRY(gsf__glb_integer(glb, object, key, (double)list->count - 1.0, -1.0, &index));
+    *out = gsf_find_json_element(&glb->json, list, index);
+    if ((*out)->type != GSF_JSON_OBJECT) return gsf__glb_fail(glb, *out, "not an object");
+    return GSF_OK;
+}
+
+static size_t gsf__glb_type_size(int type) {
+    return type == 5126 ? 4 : type == 5122 || type == 5123 ? 2 : type == 5120 || type == 5121 ? 1 : 0;
+}
+
+// Reads the accessor of an attribute with `components` values per row.
+static gsf_result gsf__glb_read_column(const gsf__glb* glb, const gsf_json_value* attributes, const char* key, int components,
+                                       size_t* count, gsf__glb_column* out) {
+    static const char* const kinds[5] = {"", "SCALAR", "", "VEC3", "VEC4"};
+    const gsf_json_value *accessor, *view;
+    size_t type, rows, offset, first, size, stride, buffer;
+    GSF__TRY(gsf__glb_element(glb, attributes, key, "accessors", &accessor));
+    const gsf_json_value *kind = gsf__glb_member(glb, accessor, "type"),
+                         *normalized = gsf__glb_member(glb, accessor, "normalized");
+    GSF__TRY(gsf__glb_integer(glb, accessor, "componentType", 65535.0, -1.0, &type));
+    GSF__TRY(gsf__glb_integer(glb, accessor, "count", (double)UINT32_MAX, -1.0, &rows));
+    GSF__TRY(gsf__glb_integer(glb, accessor, "byteOffset", (double)UINT32_MAX, 0.0, &offset));
+    const size_t width = gsf__glb_type_size((int)type) * (size_t)components;
+    if (!kind || kind->type != GSF_JSON_STRING || strcmp(kind->string, kinds[components]) != 0 || width == 0)
+        return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:%zu: %s: not a %s of floats, bytes or shorts", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)accessor->offset, key, kinds[components]);
+    if (gsf__glb_member(glb, accessor, "sparse") || !gsf__glb_member(glb, accessor, "bufferView"))
+        return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %s is a sparse accessor, or is compressed", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)accessor->offset, key);
+    GSF__TRY(gsf__glb_element(glb, accessor, "bufferView", "bufferViews", &view));
+    GSF__TRY(gsf__glb_integer(glb, view, "buffer", (double)UINT32_MAX, -1.0, &buffer));
+    GSF__TRY(gsf__glb_integer(glb, view, "byteOffset", (double)UINT32_MAX, 0.0, &first));
+    GSF__TRY(gsf__glb_integer(glb, view, "byteLength", (double)UINT32_MAX, -1.0, &size));
+    GSF__TRY(gsf__glb_integer(glb, view, "byteStride", 65535.0, (double)width, &stride));
+    if (buffer != 0)
+        return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %s is in another file", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)view->offset, key);
+    if (first > glb->byte_count || size > glb->byte_count - first || stride < width || offset > size ||
+        (rows > 0 && (size - offset < width || (rows - 1) > (size - offset - width) / stride)))
+        return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:%zu: %s: %zu rows exceed the file's %zu bytes of arrays", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)accessor->offset, key, rows, glb->byte_count);
+    if (*count != SIZE_MAX && rows != *count) return gsf__glb_fail(glb, accessor, "attributes differ in their counts");
+    *count = rows;
+    out->data = glb->bytes + first + offset;
+    out->stride = stride;
+    out->type = (int)type;
+    out->normalized = normalized && normalized->type == GSF_JSON_TRUE;
+    return GSF_OK;
+}
+
+static float gsf__glb_value(const gsf__glb_column* column, size_t row, size_t component) {
+    const unsigned char* p = column->data + column->stride * row + gsf__glb_type_size(column->type) * component;
+    float value, largest;
+    switch (column->type) {
+        case 5126: return gsf__get_f32(p);
+        case 5120: value = (float)(*p < 128 ? *p : *p - 256), largest = 127.0f; break;
+        case 5121: value = (float)*p, largest = 255.0f; break;
+        case 5122: value = (float)(int16_t)(uint16_t)gsf__load_le(p, 2), largest = 32767.0f; break;
+        default: value = (float)gsf__load_le(p, 2), largest = 65535.0f; break;
+    }
+    return column->normalized ? fmaxf(value / largest, -1.0f) : value;
+}
+
+// out = a b, column-major; the last rows are 0 0 0 1.
+static void gsf__glb_multiply(const double a[16], const double b[16], double out[16]) {
+    double m[16];
+    for (int c = 0; c < 4; c++)
+        for (int r = 0; r < 4; r++)
+            m[4 * c + r] = a[r] * b[4 * c] + a[4 + r] * b[4 * c + 1] + a[8 + r] * b[4 * c + 2] + (c == 3 ? a[12 + r] : 0.0);
+    for (int c = 0; c < 4; c++) m[4 * c + 3] = c == 3;
+    memcpy(out, m, sizeof m);
+}
+
+// Reads `count` numbers; leaves `out` as it is if the member is missing.
+static gsf_result gsf__glb_numbers(const gsf__glb* glb, const gsf_json_value* node, const char* key, size_t count,
+                                   double* out) {
+    const gsf_json_value* list = gsf__glb_member(glb, node, key);
+    if (!list) return GSF_OK;
+    if (list->type != GSF_JSON_ARRAY || list->count != count)
+        return gsf__glb_fail(glb, list, "not a list of as many numbers as needed");
+    for (size_t i = 0; i < count; i++) {
+        const gsf_json_value* value = gsf_find_json_element(&glb->json, list, i);
+        if (value->type != GSF_JSON_NUMBER) return gsf__glb_fail(glb, value, "not a number");
+        out[i] = value->number;
+    }
+    return GSF_OK;
+}
+
+// The node's own matrix: `matrix`, or translation x rotation x scale.
+static gsf_result gsf__glb_node_matrix(const gsf__glb* glb, const gsf_json_value* node, double out[16]) {
+    double t[3] = {0.0, 0.0, 0.0}, q[4] = {0.0, 0.0, 0.0, 1.0}, s[3] = {1.0, 1.0, 1.0};
+    memset(out, 0, 16 * sizeof(double));
+    GSF__TRY(gsf__glb_numbers(glb, node, "translation", 3, t));
+    GSF__TRY(gsf__glb_numbers(glb, node, "rotation", 4, q));
+    GSF__TRY(gsf__glb_numbers(glb, node, "scale", 3, s));
+    const double x = q[0], y = q[1], z = q[2], w = q[3];
+    const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y),
+                         2 * (x * y - w * z),     1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+                         2 * (x * z + w * y),     2 * (y * z - w * x),     1 - 2 * (x * x + y * y)};
+    for (int c = 0; c < 3; c++) {
+        for (int k = 0; k < 3; k++) out[4 * c + k] = s[c] * r[3 * c + k];
+        out[12 + c] = t[c];
+    }
+    out[15] = 1.0;
+    return gsf__glb_numbers(glb, node, "matrix", 16, out);
+}
+
+// Splits part->matrix into a rotation and one scale.
+static gsf_result gsf__glb_split_matrix(const gsf__glb* glb, const gsf_json_value* at, gsf__glb_part* part) {
+    const double* m = part->matrix;
+    double lengths[3], pose[16], q[4];
+    for (int c = 0; c < 3; c++)
+        lengths[c] = sqrt(m[4 * c] * m[4 * c] + m[4 * c + 1] * m[4 * c + 1] + m[4 * c + 2] * m[4 * c + 2]);
+    const double scale = (lengths[0] + lengths[1] + lengths[2]) / 3.0;
+    const double det =
+        m[0] * (m[5] * m[10] - m[6] * m[9]) - m[4] * (m[1] * m[10] - m[2] * m[9]) + m[8] * (m[1] * m[6] - m[2] * m[5]);
+    int same = scale > 1e-30 && scale < 1e30 && fabs(det / (scale * scale * scale) - 1.0) < 1e-3;
+    for (int c = 0; c < 3; c++) same = same && fabs(lengths[c] / scale - 1.0) < 1e-3 && fabs(m[12 + c]) < 1e30;
+    if (!same)
+        return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a node that stretches or mirrors its splats", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)at->offset);
+    for (int i = 0; i < 16; i++) pose[i] = m[i] / scale;
+    gsf__quaternion_from_pose(pose, q);
+    for (int k = 0; k < 4; k++) part->quat[k] = (float)q[k];
+    part->scale = scale;
+    return GSF_OK;
+}
+
+static gsf_result gsf__glb_read_primitive(gsf__glb* glb, const gsf_json_value* primitive, const double matrix[16]) {
+    const gsf_json_value* extension = gsf__glb_member(glb, gsf__glb_member(glb, primitive, "extensions"), gsf__glb_extension);
+    const gsf_json_value* attributes = gsf__glb_member(glb, primitive, "attributes");
+    static const char* const names[GSF__GLB_SH] = {"POSITION", "ROTATION", "SCALE", "OPACITY"};
+    char key[64];
+    size_t count = SIZE_MAX;
+    if (!extension) return GSF_OK;
+    const gsf_json_value* compressed = gsf__glb_member(glb, extension, "extensions");
+    if (compressed && compressed->child)
+        return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %s is not supported", glb->name,
+                        GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)compressed->offset, glb->json.values[compressed->child].key);
+    if (!attributes || attributes->type != GSF_JSON_OBJECT) return gsf__glb_fail(glb, primitive, "splats without attributes");
+    GSF__TRY(
+        gsf__reserve(glb->ctx, (void**)&glb->parts, &glb->part_room, glb->part_count, glb->part_count + 1, sizeof *glb->parts));
+    gsf__glb_part* part = glb->parts + glb->part_count;
+    memset(part, 0, sizeof *part);
+    memcpy(part->matrix, matrix, sizeof part->matrix);
+    GSF__TRY(gsf__glb_split_matrix(glb, primitive, part));
+    for (int c = 0; c < GSF__GLB_SH; c++) {
+        snprintf(key, sizeof key, "%s%s%s", c ? gsf__glb_extension : "", c ? ":" : "", names[c]);
+        GSF__TRY(gsf__glb_read_column(glb, attributes, key, gsf__glb_sizes[c], &count, part->columns + c));
+    }
+    for (int degree = 0; degree <= 3; degree++) {  // all coefficients of a degree, or none from there on
+        for (int k = 0; k < 2 * degree + 1; k++) {
+            snprintf(key, sizeof key, "%s:SH_DEGREE_%d_COEF_%d", gsf__glb_extension, degree, k);
+            if (degree > 0 && k == 0 && !gsf__glb_member(glb, attributes, key)) goto done;
+            GSF__TRY(gsf__glb_read_column(glb, attributes, key, 3, &count, part->columns + GSF__GLB_SH + degree * degree + k));
+        }
+        part->degree = degree;
+    }
+done:
+    if (count > UINT32_MAX - glb->count || count > glb->byte_count - glb->count) // a bomb, or an instance too many
+        return gsf__glb_fail(glb, primitive, "more splats than bytes");
+    part->first = glb->count;
+    part->count = count;
+    glb->count += count;
+    if (part->degree > glb->degree) glb->degree = part->degree;
+    glb->part_count++;
+    return GSF_OK;
+}
+
+static gsf_result gsf__glb_read_node(gsf__glb* glb, const gsf_json_value* nodes, size_t index, const double parent[16],
+                                     int depth) {
+    const gsf_json_value* node = gsf_find_json_element(&glb->json, nodes, index);
+    double own[16];
+    if (depth > GSF__GLB_DEPTH || glb->nodes_met++ >= nodes->count)
+        return gsf__glb_fail(glb, node, "the nodes are no tree, or too deep");
+    GSF__TRY(gsf__glb_node_matrix(glb, node, own));
+    gsf__glb_multiply(parent, own, own);
+    if (gsf__glb_member(glb, node, "mesh")) {
+        const gsf_json_value* mesh;
+        GSF__TRY(gsf__glb_element(glb, node, "mesh", "meshes", &mesh));
+        const gsf_json_value* list = gsf__glb_member(glb, mesh, "primitives");
+        for (uint32_t i = list ? list->child : 0; i; i = glb->json.values[i].next)
+            GSF__TRY(gsf__glb_read_primitive(glb, glb->json.values + i, own));
+    }
+    const gsf_json_value* children = gsf__glb_member(glb, node, "children");
+    for (uint32_t i = children ? children->child : 0; i; i = glb->json.values[i].next) {
+        const gsf_json_value* child = glb->json.values + i;
+        if (child->type != GSF_JSON_NUMBER || !(child->number >= 0.0 && child->number < (double)nodes->count))
+            return gsf__glb_fail(glb, child, "not the index of a node");
+        GSF__TRY(gsf__glb_read_node(glb, nodes, (size_t)child->number, own, depth + 1));
+    }
+    return GSF_OK;
+}
+
+// Finds the splats of the default scene.
+static gsf_result gsf__glb_read_nodes(gsf__glb* glb) {
+    static const double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    const gsf_json_value* root = glb->json.values;
+    const gsf_json_value *nodes = gsf__glb_member(glb, root, "nodes"), *scenes = gsf__glb_member(glb, root, "scenes");
+    size_t scene;
+    if (!nodes || nodes->type != GSF_JSON_ARRAY || !scenes || scenes->type != GSF_JSON_ARRAY || !scenes->count)
+        return gsf__glb_fail(glb, NULL, "has no scene of nodes");
+    GSF__TRY(gsf__glb_integer(glb, root, "scene", (double)scenes->count - 1.0, 0.0, &scene));
+    const gsf_json_value* roots = gsf__glb_member(glb, gsf_find_json_element(&glb->json, scenes, scene), "nodes");
+    for (uint32_t i = roots ? roots->child : 0; i; i = glb->json.values[i].next) {
+        const gsf_json_value* value = glb->json.values + i;
+        if (value->type != GSF_JSON_NUMBER || !(value->number >= 0.0 && value->number < (double)nodes->count))
+            return gsf__glb_fail(glb, value, "not the index of a node");
+        GSF__TRY(gsf__glb_read_node(glb, nodes, (size_t)value->number, identity, 0));
+    }
+    if (!glb->part_count) return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s: has no splats (%s)", glb->name, gsf__glb_extension);
+    return GSF_OK;
+}
+
+static const gsf__glb_part* gsf__glb_part_of(const gsf__glb* glb, size_t i) {
+    const gsf__glb_part* part = glb->parts;
+    while (i - part->first >= part->count) part++;
+    return part;
+}
+
+static void gsf__glb_position(const void* arg, size_t i, double* out) {
+    const gsf__glb_part* part = gsf__glb_part_of((const gsf__glb*)arg, i);
+    const double* m = part->matrix;
+    double p[3];
+    for (size_t k = 0; k < 3; k++) p[k] = (double)gsf__glb_value(part->columns + GSF__GLB_POSITION, i - part->first, k);
+    for (size_t k = 0; k < 3; k++)
+        out[k] = (double)gsf__glb_axes[k] * (m[k] * p[0] + m[4 + k] * p[1] + m[8 + k] * p[2] + m[12 + k]);
+}
+
+static void gsf__glb_decode_row(const gsf__glb* glb, const gsf__glb_part* part, size_t i, gsf__decoder* job) {
+    const gsf_splats* s = job->splats;
+    const gsf__glb_column* columns = part->columns;
+    const size_t row = i - part->first, bands = (size_t)gsf_splat_count_sh(s->sh_degree);
+    const size_t stored = (size_t)gsf_splat_count_sh(part->degree);
+    double p[3];
+    gsf__glb_position(glb, i, p);
+    int bad = gsf__place_mean(s, i, p);
+    const float opacity = gsf__glb_value(columns + GSF__GLB_OPACITY, row, 0);
+    s->opacity_logits[i] = glb->logits       ? opacity
+                           : opacity <= 0.0f ? job->logits[0]
+                           : opacity >= 1.0f ? job->logits[255]
+                                             : logf(opacity / (1.0f - opacity));
+    bad |= gsf__float_is_bad(opacity);
+    for (size_t k = 0; k < 3; k++) {
+        const float scale = gsf__glb_value(columns + GSF__GLB_SCALE, row, k);
+        const float value = glb->log_scales ? scale : logf(fmaxf(scale, FLT_MIN));
+        s->log_scales[3 * i + k] = value + (part->scale == 1.0 ? 0.0f : logf((float)part->scale));
+        bad |= gsf__float_is_bad(scale);
+    }
+    float q[4];  // x y z w of the file
+    for (size_t k = 0; k < 4; k++) q[k] = gsf__glb_value(columns + GSF__GLB_ROTATION, row, k);
+    const float* n = part->quat;
+    float* quat = s->quats + 4 * i;
+    quat[0] = n[0] * q[3] - n[1] * q[0] - n[2] * q[1] - n[3] * q[2];
+    quat[1] = n[0] * q[0] + n[1] * q[3] + n[2] * q[2] - n[3] * q[1];
+    quat[2] = n[0] * q[1] - n[1] * q[2] + n[2] * q[3] + n[3] * q[0];
+    quat[3] = n[0] * q[2] + n[1] * q[1] - n[2] * q[0] + n[3] * q[3];
+    for (size_t k = 0; k < 3; k++) quat[1 + k] *= gsf__glb_axes[k];  // half a turn about z, and back
+    bad |= gsf__any_bad(quat, 4);
+    for (size_t k = 0; k < bands; k++)
+        for (size_t c = 0; c < 3; c++) {
+            const float value = k < stored ? gsf__glb_value(columns + GSF__GLB_SH + k, row, c) : 0.0f;
+            s->sh[3 * (bands * i + k) + c] = glb->signs[k] * value;
+            bad |= gsf__float_is_bad(value);
+        }
+    job->bad[i] = (uint8_t)bad;
+}
+
+static void gsf__glb_decode_chunk(void* arg, size_t chunk, int32_t worker) {
+    gsf__decoder* job = (gsf__decoder*)arg;
+    const gsf__glb* glb = (const gsf__glb*)job->file;
+    const size_t begin = chunk * GSF__CODEC_CHUNK;
+    (void)worker;
+    for (size_t i = begin; i < gsf__codec_end(job->splats->count, begin); i++)
+        gsf__glb_decode_row(glb, gsf__glb_part_of(glb, i), i, job);
+}
+
+// Early writers stored the PLY's logarithms and logits: a negative scale or an opacity outside 0..1 tells.
+static void gsf__glb_find_logs(gsf__glb* glb) {
+    for (size_t p = 0; p < glb->part_count; p++) {
+        const gsf__glb_part* part = glb->parts + p;
+        for (size_t i = 0; i < part->count; i++) {
+            const float opacity = gsf__glb_value(part->columns + GSF__GLB_OPACITY, i, 0);
+            for (size_t k = 0; k < 3; k++) glb->log_scales |= gsf__glb_value(part->columns + GSF__GLB_SCALE, i, k) < 0.0f;
+            glb->logits |= opacity < 0.0f || opacity > 1.0f;
+        }
+    }
+    if (glb->log_scales)
+        gsf_log(glb->ctx, GSF_LOG_WARNING,
+                "%s: negative scales: taken as logarithms, as written before the format's ratification", glb->name);
+    if (glb->logits) gsf_log(glb->ctx, GSF_LOG_WARNING, "%s: opacities outside 0..1: taken as logits", glb->name);
+}
+
+// Finds the chunks. *json: that of JSON.
+static gsf_result gsf__glb_open(gsf__glb* glb, const unsigned char* data, size_t size, const char** json, size_t* json_size) {
+    if (size < GSF__GLB_HEAD + GSF__GLB_CHUNK || memcmp(data, "glTF", 4) != 0)
+        return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:0: not a binary glTF file", glb->name);
+    if (gsf__load_le(data + 4, 4) != 2)
+        return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:4: glTF version %u, expected 2", glb->name,
+                        (unsigned)gsf__load_le(data + 4, 4));
+    if (gsf__load_le(data + 8, 4) > size)
+        return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:8: truncated: %u of %zu bytes", glb->name,
+                        (unsigned)gsf__load_le(data + 8, 4), size);
+    size = (size_t)gsf__load_le(data + 8, 4);
+    for (size_t at = GSF__GLB_HEAD, chunk = 0; chunk < 2 && at + GSF__GLB_CHUNK <= size; chunk++) {
+        const size_t length = (size_t)gsf__load_le(data + at, 4);
+        if (length > size - at - GSF__GLB_CHUNK || memcmp(data + at + 4, chunk ? "BIN" : "JSON", 4) != 0)
+            return gsf_fail(glb->ctx, GSF_ERROR_FORMAT, "%s:%zu: not a %s chunk, or truncated", glb->name, at,
+                            chunk ? "BIN" : "JSON");
+        if (chunk) glb->bytes = data + at + GSF__GLB_CHUNK, glb->byte_count = length;
+        else *json = (const char*)data + at + GSF__GLB_CHUNK, *json_size = length;
+        at += GSF__GLB_CHUNK + length;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__glb_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+    gsf__glb glb;
+    const char* json = "";
+    size_t json_size = 0;
+    memset(&glb, 0, sizeof glb);
+    glb.ctx = ctx;
+    glb.name = name;
+    GSF__TRY(gsf__glb_open(&glb, (const unsigned char*)data, size, &json, &json_size));
+    GSF__TRY(gsf_parse_json(ctx, name, json, json_size, &glb.json));
+    gsf_result result = gsf__glb_read_nodes(&glb);
+    if (result == GSF_OK) result = gsf_splat_make(ctx, glb.count, glb.degree, out);
+    if (result == GSF_OK) {
+        gsf__glb_find_logs(&glb);
+        gsf__sh_signs(gsf__glb_axes, glb.signs);
+        result = gsf__decode_splats(ctx, name, &glb, gsf__glb_position, gsf__glb_decode_chunk, out);
+    }
+    gsf_free(ctx, glb.parts);
+    gsf_destroy_json(ctx, &glb.json);
+    return result;
+}
+
+// The arrays of a file in their order, COLOR_0 (RGBA, u16, for viewers without splats) last.
+static void gsf__glb_encode_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__pack* job = (const gsf__pack*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__CODEC_CHUNK, n = job->count;
+    unsigned char *positions = job->out, *rotations = positions + 12 * n, *scales = rotations + 16 * n;
+    unsigned char *opacities = scales + 12 * n, *sh = opacities + 4 * n, *colors = sh + 12 * bands * n;
+    float signs[16];
+    (void)worker;
+    gsf__sh_signs(gsf__glb_axes, signs);
+    for (size_t row = begin; row < gsf__codec_end(n, begin); row++) {
+        const size_t i = job->rows[row];
+        const float opacity = 1.0f / (1.0f + expf(-s->opacity_logits[i]));
+        float q[4];
+        double rgba[4];
+        gsf__unit_quat(s->quats + 4 * i, q);
+        for (size_t k = 0; k < 3; k++) {
+            gsf__put_f32(positions + 12 * row + 4 * k, gsf__glb_axes[k] * s->means[3 * i + k]);
+            gsf__put_f32(rotations + 16 * row + 4 * k, gsf__glb_axes[k] * q[1 + k]);
+            gsf__put_f32(scales + 12 * row + 4 * k, fminf(expf(s->log_scales[3 * i + k]), FLT_MAX));
+            rgba[k] = fmin(fmax(0.5 + (double)(gsf__dc_scale * s->sh[3 * bands * i + k]), 0.0), 1.0);
+        }
+        gsf__put_f32(rotations + 16 * row + 12, q[0]);
+        gsf__put_f32(opacities + 4 * row, opacity);
+        for (size_t k = 0; k < bands; k++)
+            for (size_t c = 0; c < 3; c++)
+                gsf__put_f32(sh + 12 * (n * k + row) + 4 * c, signs[k] * s->sh[3 * (bands * i + k) + c]);
+        gsf__transfer_colors(rgba, 3, GSF_COLOR_LINEAR);
+        rgba[3] = (double)opacity;
+        for (size_t k = 0; k < 4; k++) gsf__store_le(colors + 8 * row + 2 * k, (uint64_t)(rgba[k] * 65535.0 + 0.5), 2);
+    }
+}
+
+// Appends the JSON: one accessor and one view of the buffer per attribute.
+static void gsf__glb_append_json(gsf_context* ctx, const gsf__pack* job, size_t bytes, gsf_buffer* out) {
+    const gsf_splats* s = job->splats;
+    const int bands = gsf_splat_count_sh(s->sh_degree), columns = GSF__GLB_SH + bands + 1;
+    static const char* const kinds[5] = {"", "SCALAR", "", "VEC3", "VEC4"};
+    float low[3] = {FLT_MAX, FLT_MAX, FLT_MAX}, high[3] = {-FLT_MAX, -FLT_MAX, -FLT_MAX};
+    for (size_t row = 0; row < job->count; row++)
+        for (size_t k = 0; k < 3; k++) {
+            const float v = gsf__glb_axes[k] * s->means[3 * job->rows[row] + k];
+            low[k] = fminf(low[k], v);
+            high[k] = fmaxf(high[k], v);
+        }
+    gsf_append_text(ctx, out,
+                    "{\"asset\":{\"version\":\"2.0\",\"generator\":\"gsfixer " GSF_VERSION
+                    "\"},\"extensionsUsed\":[\"%s\"],"
+                    "\"scene\":0,\"scenes\":[{\"nodes\":[0]}],\"nodes\":[{\"mesh\":0",
+                    gsf__glb_extension);
+    if (s->origin[0] != 0.0 || s->origin[1] != 0.0 || s->origin[2] != 0.0)
+        gsf_append_text(ctx, out, ",\"translation\":[%.17g,%.17g,%.17g]", (double)gsf__glb_axes[0] * s->origin[0],
+                        (double)gsf__glb_axes[1] * s->origin[1], (double)gsf__glb_axes[2] * s->origin[2]);
+    gsf_append_text(ctx, out,
+                    "}],\"meshes\":[{\"primitives\":[{\"mode\":0,\"extensions\":{\"%s\":{\"kernel\":\"ellipse\","
+                    "\"colorSpace\":\"srgb_rec709_display\"}},\"attributes\":{\"POSITION\":0",
+                    gsf__glb_extension);
+    gsf_append_text(ctx, out, ",\"%s:ROTATION\":1,\"%s:SCALE\":2,\"%s:OPACITY\":3", gsf__glb_extension, gsf__glb_extension,
+                    gsf__glb_extension);
+    for (int k = 0, degree = 0; k < bands; k++) {
+        if (k == (degree + 1) * (degree + 1)) degree++;
+        gsf_append_text(ctx, out, ",\"%s:SH_DEGREE_%d_COEF_%d\":%d", gsf__glb_extension, degree, k - degree * degree,
+                        GSF__GLB_SH + k);
+    }
+    gsf_append_text(ctx, out, ",\"COLOR_0\":%d}}]}],\"accessors\":[", columns - 1);
+    for (int c = 0; c < columns; c++) {
+        const int last = c == columns - 1, size = last ? 4 : gsf__glb_sizes[c < GSF__GLB_SH ? c : GSF__GLB_SH];
+        gsf_append_text(ctx, out, "%s{\"bufferView\":%d,\"componentType\":%d,\"count\":%zu,\"type\":\"%s\"%s", c ? "," : "", c,
+                        last ? 5123 : 5126, job->count, kinds[size], last ? ",\"normalized\":true" : "");
+        if (c == GSF__GLB_POSITION)
+            gsf_append_text(ctx, out, ",\"min\":[%.9g,%.9g,%.9g],\"max\":[%.9g,%.9g,%.9g]", (double)low[0], (double)low[1],
+                            (double)low[2], (double)high[0], (double)high[1], (double)high[2]);
+        gsf_append_text(ctx, out, "}");
+    }
+    gsf_append_text(ctx, out, "],\"bufferViews\":[");
+    for (size_t c = 0, at = 0; c < (size_t)columns; c++) {
+        const size_t row = c == (size_t)columns - 1 ? 8 : 4 * (size_t)gsf__glb_sizes[c < GSF__GLB_SH ? c : GSF__GLB_SH];
+        gsf_append_text(ctx, out, "%s{\"buffer\":0,\"byteOffset\":%zu,\"byteLength\":%zu,\"target\":34962}", c ? "," : "", at,
+                        row * job->count);
+        at += row * job->count;
+    }
+    gsf_append_text(ctx, out, "],\"buffers\":[{\"byteLength\":%zu}]}", bytes);
+}
+
+static gsf_result gsf__glb_format(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf_buffer* out) {
+    char head[GSF__GLB_HEAD + GSF__GLB_CHUNK] = {'g', 'l', 'T', 'F', 2}, chunk[GSF__GLB_CHUNK] = {0};
+    const size_t before = out->size;
+    gsf__pack job;
+    GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
+    const size_t row_bytes = 12 + 16 + 12 + 4 + 12 * (size_t)gsf_splat_count_sh(splats->sh_degree) + 8;
+    gsf_result result = GSF_OK;
+    if (job.count == 0) result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: glTF holds no empty list of splats", name);
+    else if (job.count > (UINT32_MAX - 65536) / row_bytes)
+        result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats exceed glTF's 2^32 bytes", name, job.count);
+    if (result == GSF_OK) {
+        const size_t bytes = job.count * row_bytes;
+        gsf_append_bytes(ctx, out, head, sizeof head);
+        gsf__glb_append_json(ctx, &job, bytes, out);
+        while (out->size % 4 != before % 4 && !out->failed) gsf_append_bytes(ctx, out, " ", 1);
+        const size_t json_size = out->size - before - sizeof head;
+        gsf__store_le(chunk, bytes, 4);
+        memcpy(chunk + 4, "BIN", 4);
+        gsf_append_bytes(ctx, out, chunk, sizeof chunk);
+        job.out = gsf__append_rows(ctx, out, job.count, row_bytes);
+        if (!job.out) {
+            result = GSF_ERROR_OUT_OF_MEMORY;
+        } else {
+            char* start = out->data + before;
+            gsf__store_le(start + 8, out->size - before, 4);
+            gsf__store_le(start + 12, json_size, 4);
+            memcpy(start + 16, "JSON", 4);
+            gsf__parallel_for(ctx, gsf__codec_chunks(job.count), gsf__glb_encode_chunk, &job);
+        }
+    }
+    if (result != GSF_OK) out->size = before;
+    gsf__pack_free(ctx, &job);
+    return result;
+}
+
 GSF_API gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
     const unsigned char* p = (const unsigned char*)data;
     memset(out, 0, sizeof *out);
@@ -2138,12 +2708,14 @@ GSF_API gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const voi
         case GSF_SPLAT_PLY: return gsf__parse_ply(ctx, name, data, size, out);
         case GSF_SPLAT_SPLAT: return gsf__splat_parse(ctx, name, data, size, out);
         case GSF_SPLAT_SPZ: return gsf__spz_parse(ctx, name, data, size, out);
+        case GSF_SPLAT_GLB: return gsf__glb_parse(ctx, name, data, size, out);
         case GSF_SPLAT_AUTO: break;
     }
     if (size >= 4 && memcmp(p, "ply", 3) == 0) return gsf__parse_ply(ctx, name, data, size, out);
     if (size >= 4 && ((p[0] == 0x1f && p[1] == 0x8b) || memcmp(p, "NGSP", 4) == 0))
         return gsf__spz_parse(ctx, name, data, size, out);
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ (.splat is detected only by name)", name);
+    if (size >= 4 && memcmp(p, "glTF", 4) == 0) return gsf__glb_parse(ctx, name, data, size, out);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ nor GLB (.splat is detected only by name)", name);
 }
 
 GSF_API gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out) {
@@ -2168,9 +2740,10 @@ GSF_API gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gs
         case GSF_SPLAT_PLY: return gsf__format_ply(ctx, &view, out);
         case GSF_SPLAT_SPLAT: return gsf__splat_format(ctx, name, &view, out);
         case GSF_SPLAT_SPZ: return gsf__spz_format(ctx, name, &view, d.spz_version ? d.spz_version : 3, out);
+        case GSF_SPLAT_GLB: return gsf__glb_format(ctx, name, &view, out);
         case GSF_SPLAT_AUTO: break;
     }
-    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: does not end in .ply, .splat or .spz", name);
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: does not end in .ply, .splat, .spz or .glb", name);
 }
 
 GSF_API gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_splats* splats,
@@ -3963,24 +4536,6 @@ static void gsf__put_double(gsf_context* ctx, gsf_buffer* out, double value) {
     char p[8];
     gsf__store_f64(p, value);
     gsf_append_bytes(ctx, out, p, sizeof p);
-}
-
-// Converts the rotation of a column-major matrix to a unit quaternion w x y z, w >= 0. Divides by the largest component
-// for accuracy.
-static void gsf__quaternion_from_pose(const double m[16], double q[4]) {
-    const double squares[4] = {1 + m[0] + m[5] + m[10], 1 + m[0] - m[5] - m[10], 1 - m[0] + m[5] - m[10],
-                               1 - m[0] - m[5] + m[10]};
-    const double mixed[4][4] = {{squares[0], m[6] - m[9], m[8] - m[2], m[1] - m[4]},
-                                {m[6] - m[9], squares[1], m[1] + m[4], m[8] + m[2]},
-                                {m[8] - m[2], m[1] + m[4], squares[2], m[6] + m[9]},
-                                {m[1] - m[4], m[8] + m[2], m[6] + m[9], squares[3]}};
-    int best = 0;
-    double norm = 0.0;
-    for (int i = 1; i < 4; i++)
-        if (squares[i] > squares[best]) best = i;
-    for (int i = 0; i < 4; i++) q[i] = mixed[best][i], norm += q[i] * q[i];
-    norm = q[0] < 0.0 ? -sqrt(norm) : sqrt(norm);
-    for (int i = 0; i < 4; i++) q[i] /= norm;
 }
 
 static int gsf__same_intrinsics(const gsf_camera* a, const gsf_camera* b) {

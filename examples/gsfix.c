@@ -151,8 +151,8 @@ static const option_spec option_specs[] = {
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
      "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
-    {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
-     "also write OUT/splats.splat (no view-dependent colour) or OUT/splats.spz"},
+    {"--also", TEXT, AT(also), 0, 0, "LIST", "fix",
+     "also write OUT/splats.splat (no view-dependent colour), splats.spz, splats.glb: a list of splat, spz, glb"},
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset evaluate",
      "override individual settings of the trainer and of the repair loop:"},
     {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset evaluate",
@@ -208,10 +208,10 @@ typedef struct command_spec {
 } command_spec;
 
 static const command_spec command_specs[] = {
-    {"info", "SCENE | SPLATS.ply|.splat|.spz | MANIFEST.json",
+    {"info", "SCENE | SPLATS.ply|.splat|.spz|.glb | MANIFEST.json",
      "print the contents of a scene, a splat file, or a manifest of gsfix dataset, whose files are checked", 1, run_info},
     {"fix", "SCENE --out DIR", "train splats on photos, repair them, and write a report", 1, gsfix_run_fix},
-    {"render", "SPLATS.ply|.splat|.spz (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
+    {"render", "SPLATS.ply|.splat|.spz|.glb (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
      run_render},
     {"filter", "SCENE --out SCENE2", "write a COLMAP model with only the points that the training views see", 1,
      run_filter},
@@ -768,7 +768,8 @@ static int run_info(gsfix_app* app) {
     const char* path = app->o.inputs[0];
     const char* ending = strrchr(path, '.');
     const int is_splats = ending && !gsfix_is_folder(path) &&
-                          (strcmp(ending, ".ply") == 0 || strcmp(ending, ".splat") == 0 || strcmp(ending, ".spz") == 0);
+                          (strcmp(ending, ".ply") == 0 || strcmp(ending, ".splat") == 0 || strcmp(ending, ".spz") == 0 ||
+                           strcmp(ending, ".glb") == 0);
     const int is_manifest = ending && strcmp(ending, ".json") == 0 && gsfix_is_manifest(path);
     const gsf_result result = is_splats     ? info_splats(app)
                               : is_manifest ? gsfix_info_dataset(app, path)

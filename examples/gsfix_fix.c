@@ -124,6 +124,24 @@ static int apply_settings(gsfix_app* app, gsfix_setup* setup) {
     return 0;
 }
 
+// ---- --also ----------------------------------------------------------------------
+
+static const char* const also_formats[] = {"splat", "spz", "glb"};
+enum { ALSO_COUNT = sizeof also_formats / sizeof *also_formats };
+
+static const char* also_format_at(const char* word) { // the format that a list's word names, or NULL
+    const size_t n = strcspn(word, ",");
+    for (int i = 0; i < ALSO_COUNT; i++)
+        if (strlen(also_formats[i]) == n && strncmp(also_formats[i], word, n) == 0) return also_formats[i];
+    return NULL;
+}
+
+static int wants_also(const gsfix_app* app, int format) {
+    for (const char* p = app->o.also ? app->o.also : ""; *p; p += strcspn(p, ","), p += *p == ',')
+        if (also_format_at(p) == also_formats[format]) return 1;
+    return 0;
+}
+
 static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
 int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
@@ -143,6 +161,8 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     if (code) return code;
     if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // an explicit 0: the desc's zero means default
     if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
+    for (const char* p = app->o.also ? app->o.also : ""; *p; p += strcspn(p, ","), p += *p == ',')
+        if (!also_format_at(p)) return gsfix_misused(app, "--also: \"%s\" is not a list of splat, spz, glb", app->o.also);
     if (app->o.compare && !has_restorer(app))
         return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     if (app->o.filtered && !has_restorer(app)) return gsfix_misused(app, "--filtered: needs a --restorer");
@@ -803,12 +823,11 @@ static gsf_result open_fix_out(fix_run* run) {
     gsfix_app* app = run->app;
     static const char* const always[] = {"checkpoint", "dit.checkpoint", "splats.ply", "metrics.json", "report.html"};
     static const char* const repair[] = {"fixed/round*_window*_*.png", "report/round*_window*_*.png"};
-    const char* also = app->o.also ? app->o.also : "";
     const size_t names = run->task ? 2 : sizeof always / sizeof *always; // for a task the checkpoints only
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < names && result == GSF_OK; i++) result = gsfix_claim(app, "%s", always[i]);
-    if (result == GSF_OK && strstr(also, "splat")) result = gsfix_claim(app, "splats.splat");
-    if (result == GSF_OK && strstr(also, "spz")) result = gsfix_claim(app, "splats.spz");
+    for (int i = 0; i < ALSO_COUNT && result == GSF_OK; i++)
+        if (wants_also(app, i)) result = gsfix_claim(app, "splats.%s", also_formats[i]);
     for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_view_stem(&run->scene, run->split.test[i]);
         result = gsfix_claim(app, "test/%s.png", stem.s);
@@ -1179,22 +1198,22 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
     gsfix_print_stages(app);
-    const char* also = app->o.also ? app->o.also : "";
-    gsfix_print(app, "wrote      %s/report.html  splats.ply%s%s  metrics.json  test/%s", app->o.out,
-                strstr(also, "splat") ? "  splats.splat" : "", strstr(also, "spz") ? "  splats.spz" : "",
+    char also[64] = "";
+    for (int i = 0; i < ALSO_COUNT; i++)
+        if (wants_also(app, i)) snprintf(also + strlen(also), sizeof also - strlen(also), "  splats.%s", also_formats[i]);
+    gsfix_print(app, "wrote      %s/report.html  splats.ply%s  metrics.json  test/%s", app->o.out, also,
                 h->round_count ? "  fixed/" : "");
 }
 
 static gsf_result save_splats(fix_run* run, const gsf_splats* splats) {
     gsf_context* ctx = run->ctx;
-    const char *out = run->app->o.out, *also = run->app->o.also;
+    const char* out = run->app->o.out;
     gsf_splats view = *splats;
     view.antialiased = run->setup.fix.train.render.antialiased;
     gsf_result result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.ply", out).s, &view, NULL);
-    if (result == GSF_OK && also && strstr(also, "splat"))
-        result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.splat", out).s, &view, NULL);
-    if (result == GSF_OK && also && strstr(also, "spz"))
-        result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.spz", out).s, &view, NULL);
+    for (int i = 0; i < ALSO_COUNT && result == GSF_OK; i++)
+        if (wants_also(run->app, i))
+            result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.%s", out, also_formats[i]).s, &view, NULL);
     return result;
 }
 

@@ -1,5 +1,5 @@
 // render_ply.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/render_ply.c -o render_ply -lm
-// Renders splats (.ply, .splat, .spz) to PNG files:   render_ply SPLATS OUT_PREFIX [CAMERAS.json]
+// Renders splats (.ply, .splat, .spz, .glb) to PNG files:   render_ply SPLATS OUT_PREFIX [CAMERAS.json]
 // Without a camera list (the format of `gsfix path`) it renders an orbit of 8 images around the centre of the splats.
 // Writes OUT_PREFIX000.png, OUT_PREFIX001.png, ...
 #include "gsfixer_splat.h"

@@ -1,4 +1,4 @@
-// test_formats.c - .splat and .spz: hand-made files, files written by Niantic's spz library, error bounds of a round
+// test_formats.c - .splat, .spz and .glb: hand-made files, files written by Niantic's spz library, error bounds of a round
 // trip, damage, failing allocations, non-finite splats, positions out of range; and the gzip layer.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -284,20 +284,22 @@ static void test_round_trips(void) {
     const bounds spz3 = {0.5 / 4096 * 1.001, 1.0 / 32 * 1.001, u8, u8 / 0.15, 4.5 / 128 * 1.001, 8.5 / 128 * 1.001, 0.002};
     bounds spz2 = spz3;
     spz2.quat = 0.16;
+    const bounds glb = {0, 2e-6, 1e-7, 0, 0, 0, 1e-6};
     const bounds splat = {2e-6, 2e-6, u8, u8 / 0.2820947, 0, 0, 0.012};
     for (size_t c = 0; c < 4; c++)
         for (int32_t degree = 0; degree <= 3; degree++)
-            for (int kind = 0; kind < 3; kind++) { // .splat, SPZ 2, SPZ 3
+            for (int kind = 0; kind < 4; kind++) { // .splat, SPZ 2, SPZ 3, .glb
+                if (kind == 3 && counts[c] == 0) continue; // glTF has no empty arrays
                 counter count;
                 gsf_context ctx = make_context(&count, 0);
                 gsf_splats s = random_splats(&ctx, counts[c], degree, 15.0, 100 * c + (uint64_t)degree), again;
                 gsf_splat_save_desc desc = {GSF_SPLAT_AUTO, 0, kind == 1 ? 2 : 0};
-                const char* path = test_scratch(kind ? "trip.spz" : "trip.splat");
+                const char* path = test_scratch(kind == 3 ? "trip.glb" : kind ? "trip.spz" : "trip.splat");
                 s.antialiased = degree & 1;
                 CHECK_OK(&ctx, gsf_splat_save(&ctx, path, &s, &desc));
                 if (CHECK_OK(&ctx, gsf_splat_load(&ctx, path, &again))) {
-                    CHECK(again.antialiased == (kind ? s.antialiased : 0) && again.sh_degree == (kind ? degree : 0));
-                    check_close(&s, &again, kind == 0 ? splat : kind == 1 ? spz2 : spz3);
+                    CHECK(again.antialiased == (kind % 3 ? s.antialiased : 0) && again.sh_degree == (kind ? degree : 0));
+                    check_close(&s, &again, kind == 0 ? splat : kind == 1 ? spz2 : kind == 2 ? spz3 : glb);
                     gsf_splat_destroy(&ctx, &again);
                 }
                 gsf_splat_destroy(&ctx, &s);
@@ -310,8 +312,8 @@ static void test_workers(void) {
     counter count, odd_count;
     gsf_context ctx = make_context(&count, 0), odd = make_context(&odd_count, 1);
     gsf_splats s = random_splats(&ctx, 20000, 3, 2.0, 5), again;
-    static const char* const names[2] = {"x.splat", "x.spz"};
-    for (int i = 0; i < 2; i++) {
+    static const char* const names[3] = {"x.splat", "x.spz", "x.glb"};
+    for (int i = 0; i < 3; i++) {
         gsf_buffer a, b;
         memset(&a, 0, sizeof a);
         memset(&b, 0, sizeof b);
@@ -334,10 +336,10 @@ static void test_workers(void) {
 
 static void test_not_finite(void) {
     static const float evil[3] = {NAN, INFINITY, -INFINITY};
-    static const char* const names[2] = {"x.splat", "x.spz"};
+    static const char* const names[3] = {"x.splat", "x.spz", "x.glb"};
     for (int attribute = 0; attribute < 5; attribute++)
         for (int e = 0; e < 3; e++)
-            for (int f = 0; f < 2; f++) {
+            for (int f = 0; f < 3; f++) {
                 counter count;
                 gsf_context ctx = make_context(&count, 0);
                 gsf_splats s = random_splats(&ctx, 5, 1, 1.0, 3), again;
@@ -377,8 +379,8 @@ static void test_not_finite(void) {
         s.opacity_logits[1] = 3e38f;
         for (size_t i = 0; i < 8; i++) s.quats[i] = i < 4 ? 3e38f : 1e-45f;
         for (size_t i = 0; i < 6; i++) s.sh[i] = i < 3 ? -3e38f : 3e38f;
-        for (int f = 0; f < 2; f++) {
-            static const char* const limits[2] = {"y.splat", "y.spz"};
+        for (int f = 0; f < 3; f++) {
+            static const char* const limits[3] = {"y.splat", "y.spz", "y.glb"};
             gsf_buffer text;
             gsf_splats again;
             memset(&text, 0, sizeof text);
@@ -471,16 +473,16 @@ static void test_types(void) {
     counter count;
     gsf_context ctx = make_context(&count, 0);
     gsf_splats s = random_splats(&ctx, 7, 2, 1.0, 11), again;
-    static const gsf_splat_type types[3] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ};
-    static const char* const names[4] = {"a.ply", "a.SPLAT", "a.Spz", "a"};
-    for (int t = 0; t < 3; t++) {
+    static const gsf_splat_type types[4] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ, GSF_SPLAT_GLB};
+    static const char* const names[5] = {"a.ply", "a.SPLAT", "a.Spz", "a.glB", "a"};
+    for (int t = 0; t < 4; t++) {
         gsf_buffer text;
         gsf_splat_save_desc desc = {types[t], 0, 0};
         memset(&text, 0, sizeof text);
         CHECK_OK(&ctx, gsf_splat_format(&ctx, "nothing", &s, &desc, &text));
-        for (int n = 0; n < 4; n++) {
+        for (int n = 0; n < 5; n++) {
             const gsf_result r = gsf_splat_parse(&ctx, names[n], text.data, text.size, &again);
-            CHECK((r == GSF_OK) == (n == t || (n == 3 && t != 1)));
+            CHECK((r == GSF_OK) == (n == t || (n == 4 && t != 1)));
             if (r == GSF_OK) CHECK(again.count == 7);
             else CHECK(r == GSF_ERROR_FORMAT && strncmp(ctx.error, names[n], strlen(names[n])) == 0);
             gsf_splat_destroy(&ctx, &again);
@@ -625,8 +627,8 @@ static void test_claims(void) {
 }
 
 static void test_out_of_memory(void) {
-    static const char* const names[2] = {"x.splat", "x.spz"};
-    for (int f = 0; f < 2; f++)
+    static const char* const names[3] = {"x.splat", "x.spz", "x.glb"};
+    for (int f = 0; f < 3; f++)
         for (int reading = 0; reading < 2; reading++)
             for (size_t k = 1;; k++) {
                 counter count;
@@ -736,6 +738,177 @@ static void test_gzip(void) {
     CHECK(count.live == 0);
 }
 
+// ---- glTF ----------------------------------------------------------------------
+
+// A GLB file of a JSON text and arrays; freed by the caller.
+static unsigned char* glb_of(const char* json, const void* arrays, size_t array_size, size_t* size) {
+    const size_t text = strlen(json), padded = (text + 3) / 4 * 4;
+    *size = 28 + padded + array_size;
+    unsigned char* p = (unsigned char*)malloc(*size);
+    const uint32_t words[3] = {(uint32_t)*size, (uint32_t)padded, (uint32_t)array_size};
+    memcpy(p, "glTF\2\0\0\0....", 12);
+    memcpy(p + 16, "JSON", 4);
+    memset(p + 20, ' ', padded);
+    memcpy(p + 20, json, text);
+    memcpy(p + 24 + padded, "BIN", 4);
+    memcpy(p + 28 + padded, arrays, array_size);
+    for (int k = 0; k < 12; k++) {
+        unsigned char* at = k < 4 ? p + 8 + k : k < 8 ? p + 12 + k - 4 : p + 20 + padded + (size_t)k - 8;
+        *at = (unsigned char)(words[k / 4] >> 8 * (k % 4));
+    }
+    return p;
+}
+
+#define GLB_NODES "{\"asset\":{\"version\":\"2.0\"},\"scene\":1,\"scenes\":[{},{\"nodes\":[1]}],\"nodes\":["
+#define GLB_REST "]," \
+    "\"meshes\":[{\"primitives\":[{\"mode\":4,\"attributes\":{\"POSITION\":9}},{\"mode\":0,\"attributes\":{" \
+    "\"POSITION\":0,\"KHR_gaussian_splatting:ROTATION\":1,\"KHR_gaussian_splatting:SCALE\":2," \
+    "\"KHR_gaussian_splatting:OPACITY\":3,\"KHR_gaussian_splatting:SH_DEGREE_0_COEF_0\":4}," \
+    "\"extensions\":{\"KHR_gaussian_splatting\":{\"kernel\":\"ellipse\",\"colorSpace\":\"srgb_rec709_display\"}}}]}]," \
+    "\"accessors\":[{\"bufferView\":0,\"componentType\":5126,\"count\":2,\"type\":\"VEC3\"}," \
+    "{\"bufferView\":0,\"byteOffset\":12,\"componentType\":5122,\"normalized\":true,\"count\":2,\"type\":\"VEC4\"}," \
+    "{\"bufferView\":0,\"byteOffset\":20,\"componentType\":5123,\"count\":2,\"type\":\"VEC3\"}," \
+    "{\"bufferView\":0,\"byteOffset\":26,\"componentType\":5121,\"normalized\":true,\"count\":2,\"type\":\"SCALAR\"}," \
+    "{\"bufferView\":1,\"componentType\":5126,\"count\":2,\"type\":\"VEC3\"}]," \
+    "\"bufferViews\":[{\"buffer\":0,\"byteLength\":56,\"byteStride\":28},{\"buffer\":0,\"byteOffset\":56,\"byteLength\":24}]," \
+    "\"buffers\":[{\"byteLength\":80}]}"
+#define GLB_TREE "{\"mesh\":0,\"rotation\":[0,0,0.70710678118654757,0.70710678118654757]}," \
+    "{\"children\":[0],\"translation\":[10,20,30],\"scale\":[2,2,2]}"
+
+// Two splats, interleaved: position f32 x 3 | rotation i16 x 4 | scale u16 x 3 | opacity u8 | unused; then colours.
+static void glb_arrays(unsigned char out[80]) {
+    const float positions[2][3] = {{1.0f, 2.0f, 3.0f}, {0.0f, 0.0f, 0.0f}}, colors[6] = {1, 2, 3, 4, 5, 6};
+    const int16_t turn[4] = {0, 0, 32767, 0}; // half a turn about z
+    const uint16_t scales[3] = {1, 2, 4};
+    memset(out, 0, 80);
+    for (int i = 0; i < 2; i++) {
+        memcpy(out + 28 * i, positions[i], 12);
+        memcpy(out + 28 * i + 12, turn, 8);
+        memcpy(out + 28 * i + 20, scales, 6);
+        out[28 * i + 26] = i ? 255 : 51;
+    }
+    memcpy(out + 56, colors, 24);
+}
+
+static void test_glb(void) { // nodes in nodes, other component types, files of early writers, refusals
+    counter count;
+    gsf_context ctx = make_context(&count, 0);
+    unsigned char arrays[80];
+    size_t size;
+    gsf_splats s;
+    glb_arrays(arrays);
+    unsigned char* file = glb_of(GLB_NODES GLB_TREE GLB_REST, arrays, sizeof arrays, &size);
+    if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "tree.glb", file, size, &s))) {
+        CHECK(s.count == 2 && s.sh_degree == 0 && warnings == 0);
+        // (1,2,3), turned by 90 degrees about z: (-2,1,3); doubled and moved: (6,22,36); x and y negated
+        const double at[6] = {-6.0, -22.0, 36.0, -10.0, -20.0, 30.0};
+        for (int k = 0; k < 6; k++) CHECK_NEAR(s.means[k], at[k], 1e-5);
+        for (int k = 0; k < 3; k++) CHECK_NEAR(s.log_scales[k], log(2.0 * (1 << k)), 1e-6);
+        CHECK_NEAR(fabsf(s.quats[0]), sqrt(0.5), 1e-6); // 180 + 90 degrees about z, which x and y negated leave alone
+        CHECK_NEAR(fabsf(s.quats[3]), sqrt(0.5), 1e-6);
+        CHECK(s.quats[0] * s.quats[3] < 0.0f);
+        CHECK_NEAR(sigmoid((double)s.opacity_logits[0]), 0.2, 1e-6);
+        CHECK_NEAR(sigmoid((double)s.opacity_logits[1]), 0.999, 1e-4);
+        for (int k = 0; k < 6; k++) CHECK(s.sh[k] == (float)(k + 1));
+        gsf_splat_destroy(&ctx, &s);
+    }
+    free(file);
+    static const struct { const char *nodes, *error; gsf_result result; } bad[] = {
+        {"{},{\"children\":[1]}", "no tree", GSF_ERROR_FORMAT},
+        {"{\"mesh\":0},{\"children\":[0,0]}", "no tree", GSF_ERROR_FORMAT},
+        {"{\"mesh\":1},{\"children\":[0]}", "\"mesh\" is not", GSF_ERROR_FORMAT},
+        {"{\"mesh\":0},{\"children\":[7]}", "index of a node", GSF_ERROR_FORMAT},
+        {"{\"mesh\":0},{}", "has no splats", GSF_ERROR_FORMAT},
+        {"{\"mesh\":0},{\"children\":[0],\"scale\":[1,1,2]}", "stretches", GSF_ERROR_UNSUPPORTED},
+        {"{\"mesh\":0},{\"children\":[0],\"scale\":[1,1,-1]}", "mirrors", GSF_ERROR_UNSUPPORTED},
+        {"{\"mesh\":0},{\"children\":[0],\"scale\":[1,1]}", "as many numbers", GSF_ERROR_FORMAT},
+        {"{\"mesh\":0},{\"children\":[0],\"matrix\":[1,0,0,0,0,1,0,0,0,0,1,0,\"x\",0,0,1]}", "not a number", GSF_ERROR_FORMAT},
+    };
+    for (size_t i = 0; i < sizeof bad / sizeof *bad; i++) {
+        char json[4096];
+        snprintf(json, sizeof json, "%s%s%s", GLB_NODES, bad[i].nodes, GLB_REST);
+        file = glb_of(json, arrays, sizeof arrays, &size);
+        CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "bad.glb", file, size, &s), bad[i].result);
+        CHECK(strstr(ctx.error, bad[i].error) && strncmp(ctx.error, "bad.glb:", 8) == 0 && !s.owned);
+        free(file);
+    }
+    file = glb_of(GLB_NODES "{\"mesh\":0},{\"mesh\":0,\"children\":[0]}" GLB_REST, arrays, sizeof arrays, &size); // twice
+    CHECK_OK(&ctx, gsf_splat_parse(&ctx, "two.glb", file, size, &s));
+    CHECK(s.count == 4 && memcmp(s.means, s.means + 6, 6 * sizeof(float)) == 0);
+    gsf_splat_destroy(&ctx, &s);
+    free(file);
+    CHECK(count.live == 0 && warnings == 0);
+    // logarithms of scales and logits of opacities, as written before the extension was ratified
+    s = random_splats(&ctx, 20, 1, 1.0, 23);
+    gsf_splats early;
+    gsf_buffer text;
+    memset(&text, 0, sizeof text);
+    CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.glb", &s, NULL, &text));
+    unsigned char* scales = (unsigned char*)text.data + text.size - 20 * (8 + 48 + 4 + 12);
+    for (size_t i = 0; i < 60; i++) gsf__put_f32(scales + 4 * i, s.log_scales[i]);
+    for (size_t i = 0; i < 20; i++) gsf__put_f32(scales + 240 + 4 * i, s.opacity_logits[i]);
+    if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "early.glb", text.data, text.size, &early))) {
+        CHECK(warnings == 2 && memcmp(early.log_scales, s.log_scales, 240) == 0);
+        CHECK(memcmp(early.opacity_logits, s.opacity_logits, 80) == 0);
+        gsf_splat_destroy(&ctx, &early);
+    }
+    gsf_destroy_buffer(&ctx, &text);
+    gsf_splat_destroy(&ctx, &s);
+    CHECK_OK(&ctx, gsf_splat_make(&ctx, 0, 0, &s));
+    CHECK_RESULT(&ctx, gsf_splat_format(&ctx, "none.glb", &s, NULL, &text), GSF_ERROR_DEGENERATE);
+    gsf_destroy_buffer(&ctx, &text);
+    gsf_splat_destroy(&ctx, &s);
+    CHECK(count.live == 0);
+}
+
+static void test_glb_origin(void) { // is kept, as the node's translation; with `local` it is not written
+    counter count;
+    gsf_context ctx = make_context(&count, 0);
+    gsf_splats s = random_splats(&ctx, 300, 0, 3.0, 9), again;
+    s.origin[0] = 4512345.0;
+    s.origin[2] = 5400000.25;
+    for (int local = 0; local < 2; local++) {
+        const gsf_splat_save_desc desc = {GSF_SPLAT_AUTO, local, 0};
+        gsf_buffer text;
+        double worst = 0.0;
+        memset(&text, 0, sizeof text);
+        CHECK_OK(&ctx, gsf_splat_format(&ctx, "far.glb", &s, &desc, &text));
+        if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "far.glb", text.data, text.size, &again))) {
+            for (size_t i = 0; i < 3 * s.count; i++)
+                worst = fmax(worst, fabs(again.origin[i % 3] - (local ? 0.0 : s.origin[i % 3]) + again.means[i] - s.means[i]));
+            CHECK(worst <= (local ? 0.0 : 1e-6));
+            gsf_splat_destroy(&ctx, &again);
+        }
+        gsf_destroy_buffer(&ctx, &text);
+    }
+    gsf_splat_destroy(&ctx, &s);
+    CHECK(count.live == 0 && warnings == 0);
+}
+
+static void test_glb_damage(void) { // cut anywhere; any byte of header and JSON changed
+    counter count;
+    gsf_context ctx = make_context(&count, 0);
+    unsigned char arrays[80];
+    size_t size;
+    glb_arrays(arrays);
+    unsigned char* file = glb_of(GLB_NODES GLB_TREE GLB_REST, arrays, sizeof arrays, &size);
+    for (size_t cut = 0; cut < size; cut++) {
+        unsigned char* part = exact_copy(file, cut);
+        parse_damaged(&ctx, "cut.glb", part, cut, 0);
+        free(part);
+    }
+    for (size_t at = 0; at < size; at++)
+        for (int flip = 1; flip < 256; flip += at < 20 ? 1 : 37) {
+            file[at] ^= (unsigned char)flip;
+            unsigned char* whole = exact_copy(file, size);
+            parse_damaged(&ctx, "flip.glb", whole, size, 1);
+            free(whole);
+            file[at] ^= (unsigned char)flip;
+        }
+    free(file);
+    CHECK(count.live == 0);
+}
+
 int main(void) {
     test_splat_by_hand();
     test_spz_by_hand();
@@ -748,6 +921,9 @@ int main(void) {
     test_damage();
     test_claims();
     test_out_of_memory();
+    test_glb();
+    test_glb_origin();
+    test_glb_damage();
     test_gzip();
     return test_report();
 }

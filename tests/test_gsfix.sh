@@ -93,7 +93,7 @@ printf '#!/bin/sh\ncp "$1"/frames/00000.png "$1/out/"\n' > short.sh
 printf '#!/bin/sh\ncp "$1"/frames/*.png "$1/out/"; cp "$1"/refs/00000.png "$1/out/00001.png"; printf x > "$1/out/00002.png"\n' > broken.sh
 chmod +x ./*.sh
 small=(--views 3 --iterations 30 --set "rounds=1,windows=1,window_frames=4" --max-size 48)
-expect 0 "$gsfix" fix "$scene" --out a "${small[@]}" --restorer "exec:$PWD/copy.sh" --also splat,spz --json
+expect 0 "$gsfix" fix "$scene" --out a "${small[@]}" --restorer "exec:$PWD/copy.sh" --also splat,spz,glb --json
 is_json stdout
 is_json a/metrics.json
 cmp stdout a/metrics.json || fail "--json and metrics.json differ"
@@ -212,7 +212,7 @@ done
 [ "$(numbers psnr stdout | tail -n 1)" != "$(numbers psnr_seen stdout | tail -n 1)" ] || fail "metrics: the masks change nothing"
 expect 0 "$gsfix" info a/splats.ply
 splats=$(grep '^splats' stdout)
-for file in splats.splat splats.spz; do # the same number of splats
+for file in splats.splat splats.spz splats.glb; do # the same number of splats
     expect 0 "$gsfix" info a/$file
     [ "$(grep -o '^splats *[0-9]*' stdout)" = "$(echo "$splats" | grep -o '^splats *[0-9]*')" ] || fail "a/$file has other splats"
     expect 0 "$gsfix" render a/$file --scene "$scene" --max-size 48 --out frames_$file
