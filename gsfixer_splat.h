@@ -20,6 +20,7 @@
        that was not zeroed is refused with GSF_ERROR_INVALID_ARGUMENT.
 
    CONFIGURATION (define before the implementation)
+       GSF_USE_ZSTD         reads and writes version 4 of .spz (link zstd)
        GSF_USE_EMBREE       traces the rays of the visible-point filter with Embree (link embree3 or embree4); without it
                             the same discs are projected into a z-buffer, with the same result
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> if available, else <embree3/rtcore.h>
@@ -160,14 +161,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* sp
                whatever the origin, so that every viewer can read the file).
        .splat  32 bytes per splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0
                are lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
-       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes per splat. Versions 1 to 3 are read, 2 and 3 written.
+       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes per splat; version 4 packs each array with zstd, whose
+               memory does not come from the context. Versions 1 to 4 are read, 2 to 4 written.
                Errors: positions half a step (2^-12; finer if the median scale is below 2^-7, coarser if a coordinate
                exceeds 2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH
                4.5/128 (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15 for
                small w). Axes are converted to and from SPZ's (y and z negated), as Niantic's library does. Extensions
-               and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than 2^30 bytes of
-               content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under
-               GSF_NO_STB.
+               and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 without GSF_USE_ZSTD; in gzip
+               more than 2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read, and reading at all
+               under GSF_NO_STB.
        .glb    Binary glTF 2.0 with KHR_gaussian_splatting as ratified: floats, 64 (SH degree 0) to 244 bytes per splat,
                and COLOR_0 for viewers without splats. The origin becomes the node's translation, so that positions keep
                their precision. Axes are converted to and from glTF's (x and y negated). All primitives of the default
@@ -180,15 +182,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* sp
    with `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers.
    Splats with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An
    opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a
-   file that claims more content than DEFLATE can compress into it (1032 times its size) is refused in advance. */
+   file that claims more content than can be compressed into it (DEFLATE: 1032 times its size) is refused in advance. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ, GSF_SPLAT_GLB } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
     gsf_splat_type type;  // AUTO: by the extension, which must then be one of the four
     int32_t local;        // write positions relative to splats->origin, which the file does not store
-    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of
+    int32_t spz_version;  // 2 to 4; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of
                           // the rotation error (not visible for compact splats). Use 2 for readers from before July 2025
-                          // and for glTF's KHR_gaussian_splatting_compression_spz_2
+                          // and for glTF's KHR_gaussian_splatting_compression_spz_2; 4 has the values of 3
 } gsf_splat_save_desc;
 
 // Any of the formats.
@@ -770,6 +772,10 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 #include "gsfixer_traj.h"
 
 #include <time.h>
+
+#ifdef GSF_USE_ZSTD
+#include <zstd.h>
+#endif
 
 #ifdef GSF_USE_EMBREE
 #ifndef GSF_EMBREE_INCLUDE
@@ -1848,7 +1854,7 @@ static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const voi
     return result;
 }
 
-/* .spz (Niantic), versions 1 to 3: a gzip file of, little-endian,
+/* .spz (Niantic): a gzip file of, little-endian,
        magic u32 0x5053474e | version u32 | count u32 | SH degree u8 | fraction bits u8 | flags u8 | reserved u8
        positions   count x 3 x i24, in units of 2^-fraction; version 1: 3 x float16
        opacities   count x u8 of [0,1]
@@ -1858,10 +1864,14 @@ static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const voi
                    version 3: count x u32: index (x y z w) of the largest component in the top 2 bits, then sign and
                    9 bits of each other component in units of sqrt(1/2) / 511; the largest is positive
        SH          count x (K - 1) x 3 x u8: 128 + 128 * coefficient, rounded to 5 (band 1) or 4 bits when writing
+   Version 4 is not in gzip: this head, then from byte 15 on the number of streams u8, the offset of their table u32 and 12
+   zeros, then extensions. The table has two u64 per stream, its compressed and its whole size; after it come the streams,
+   one for each of the arrays above that is not empty, in their order and compressed with zstd.
    SPZ's axes are right, up, back; ours (and PLY's) are right, down, front. So y and z of positions and quaternions
    change sign, and some SH coefficients. */
 
 enum { GSF__SPZ_HEAD = 16, GSF__SPZ_ANTIALIASED = 1, GSF__SPZ_EXTENDED = 2, GSF__SPZ_FRACTION_MAX = 23 };
+enum { GSF__SPZ_HEAD4 = 32, GSF__SPZ_ARRAYS = 6, GSF__SPZ_LEVEL = 12 }; // zstd's level, as in Niantic's encoder
 
 static const float gsf__spz_axes[3] = {1.0f, -1.0f, -1.0f};
 static const float gsf__spz_color = 0.15f, gsf__sqrt_half = 0.70710678118654752440f;
@@ -1876,7 +1886,7 @@ typedef struct gsf__spz { // decompressed content of a file
 
 static size_t gsf__spz_position_size(int version) { return version == 1 ? 6 : 9; }
 
-static size_t gsf__spz_rotation_size(int version) { return version == 3 ? 4 : 3; }
+static size_t gsf__spz_rotation_size(int version) { return version >= 3 ? 4 : 3; }
 
 static size_t gsf__spz_row(int version, int degree) {
     return gsf__spz_position_size(version) + 1 + 3 + 3 + gsf__spz_rotation_size(version) +
@@ -1894,6 +1904,15 @@ static gsf__spz_arrays gsf__spz_place(unsigned char* content, size_t count, int 
     return a;
 }
 
+// The sizes of the arrays in bytes.
+static void gsf__spz_array_sizes(size_t count, int version, int degree, size_t sizes[GSF__SPZ_ARRAYS]) {
+    sizes[0] = count * gsf__spz_position_size(version);
+    sizes[1] = count;
+    sizes[2] = sizes[3] = 3 * count;
+    sizes[4] = count * gsf__spz_rotation_size(version);
+    sizes[5] = count * 3 * (size_t)(degree * (degree + 2));
+}
+
 static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
                                      gsf__spz* spz) {
     memset(spz, 0, sizeof *spz);
@@ -1901,8 +1920,8 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
     if (size < GSF__SPZ_HEAD || memcmp(p, "NGSP", 4) != 0)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 0: not an SPZ file (magic NGSP expected)", name);
     const unsigned version = (unsigned)gsf__load_le(p + 4, 4);
-    if (version < 1 || version > 3)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %u, expected 1 to 3", name, version);
+    if (version < 1 || version > 4)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %u, expected 1 to 4", name, version);
     spz->version = (int)version;
     spz->count = (size_t)gsf__load_le(p + 8, 4);
     spz->degree = p[12];
@@ -1921,17 +1940,101 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
     return GSF_OK;
 }
 
+#ifdef GSF_USE_ZSTD
+
+enum { GSF__ZSTD_RATIO = 128 << 10 }; // a block of at most 128 KiB takes a few bytes
+
+// Reads a file of version 4, as gsf__spz_inflate.
+static gsf_result gsf__spz_read_streams(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
+                                        gsf__spz* spz, unsigned char** out) {
+    size_t sizes[GSF__SPZ_ARRAYS], streams = 0;
+    GSF__TRY(gsf__spz_read_head(ctx, name, data, size, spz));
+    const size_t table = size >= GSF__SPZ_HEAD4 ? (size_t)gsf__load_le(data + GSF__SPZ_HEAD, 4) : 0;
+    gsf__spz_array_sizes(spz->count, spz->version, spz->degree, sizes);
+    for (int i = 0; i < GSF__SPZ_ARRAYS; i++) streams += sizes[i] > 0;
+    if (spz->version != 4 || table < GSF__SPZ_HEAD4 || table > size || data[15] != streams || size - table < 16 * streams)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:4: not the head and table of SPZ version 4, or truncated", name);
+    if (spz->size / GSF__ZSTD_RATIO > size)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:8: %zu splats take %zu bytes, more than the file can hold", name, spz->count,
+                        spz->size);
+    if (spz->flags & GSF__SPZ_EXTENDED)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu bytes of extensions ignored (one of them can change the axes)", name,
+                table - GSF__SPZ_HEAD4);
+    unsigned char* content = (unsigned char*)gsf_alloc(ctx, spz->size, 1);
+    if (!content) return GSF_ERROR_OUT_OF_MEMORY;
+    const unsigned char* entry = data + table;
+    size_t from = table + 16 * streams, to = GSF__SPZ_HEAD;
+    for (int i = 0; i < GSF__SPZ_ARRAYS; i++) {
+        if (sizes[i] == 0) continue;
+        const uint64_t packed = gsf__load_le(entry, 8), whole = gsf__load_le(entry + 8, 8);
+        const size_t got = packed <= size - from && whole == sizes[i]
+                               ? ZSTD_decompress(content + to, sizes[i], data + from, (size_t)packed) : SIZE_MAX;
+        if (got != sizes[i]) {
+            gsf_free(ctx, content);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: stream %d of %zu bytes is damaged", name, from, i, sizes[i]);
+        }
+        entry += 16;
+        from += (size_t)packed;
+        to += sizes[i];
+    }
+    spz->arrays = gsf__spz_place(content, spz->count, spz->version);
+    *out = content;
+    return GSF_OK;
+}
+
+// Appends the arrays of `raw` as a file of version 4.
+static gsf_result gsf__spz_append_streams(gsf_context* ctx, const char* name, const gsf__pack* job, const gsf_buffer* raw,
+                                          gsf_buffer* out) {
+    size_t sizes[GSF__SPZ_ARRAYS];
+    const size_t before = out->size;
+    char head[GSF__SPZ_HEAD4] = {0}, entry[16] = {0};
+    const char* from = raw->data + GSF__SPZ_HEAD;
+    gsf_result result = GSF_OK;
+    gsf__spz_array_sizes(job->count, job->version, job->splats->sh_degree, sizes);
+    memcpy(head, raw->data, GSF__SPZ_HEAD);
+    for (int i = 0; i < GSF__SPZ_ARRAYS; i++) head[15] = (char)(head[15] + (sizes[i] > 0));
+    head[GSF__SPZ_HEAD] = GSF__SPZ_HEAD4;
+    gsf_append_bytes(ctx, out, head, sizeof head);
+    const size_t table = out->size;
+    for (int i = 0; i < head[15]; i++) gsf_append_bytes(ctx, out, entry, sizeof entry);
+    for (int i = 0, stream = 0; i < GSF__SPZ_ARRAYS && result == GSF_OK; i++) {
+        if (sizes[i] == 0) continue;
+        const size_t at = out->size, bound = ZSTD_compressBound(sizes[i]);
+        char* to = (char*)gsf__append_rows(ctx, out, bound, 1);
+        const size_t packed = to ? ZSTD_compress(to, bound, from, sizes[i], GSF__SPZ_LEVEL) : 0;
+        if (!to) result = GSF_ERROR_OUT_OF_MEMORY;
+        else if (ZSTD_isError(packed))
+            result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: %s", name, ZSTD_getErrorName(packed));
+        if (result != GSF_OK) break;
+        out->size = at + packed;
+        gsf__store_le(out->data + table + 16 * (size_t)stream, packed, 8);
+        gsf__store_le(out->data + table + 16 * (size_t)stream + 8, sizes[i], 8);
+        from += sizes[i];
+        stream++;
+    }
+    if (result == GSF_OK && out->failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result != GSF_OK) out->size = before;
+    return result;
+}
+
+#endif // GSF_USE_ZSTD
+
 // Inflates the content into *out (freed by the caller) and sets the pointers of *spz to its arrays.
 static gsf_result gsf__spz_inflate(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
                                    gsf__spz* spz, unsigned char** out) {
     size_t whole = 0;
     *out = NULL;
+#ifdef GSF_USE_ZSTD
+    if (size >= 8 && memcmp(data, "NGSP", 4) == 0) return gsf__spz_read_streams(ctx, name, data, size, spz, out);
+#else
     if (size >= 8 && memcmp(data, "NGSP", 4) == 0)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
-                        "%s:4: SPZ version %u without gzip (version 4 uses zstd), 1 to 3 are read", name,
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:4: SPZ version %u needs zstd (GSF_USE_ZSTD)", name,
                         (unsigned)gsf__load_le(data + 4, 4));
+#endif
     GSF__TRY(gsf__gzip_read(ctx, name, data, size, out, &whole));
     gsf_result result = gsf__spz_read_head(ctx, name, *out, whole, spz);
+    if (result == GSF_OK && spz->version > 3)
+        result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %d in gzip", name, spz->version);
     if (result == GSF_OK && (whole < spz->size || (whole > spz->size && !(spz->flags & GSF__SPZ_EXTENDED))))
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 8: %zu splats take %zu bytes, the content has %zu", name,
                           spz->count, spz->size, whole);
@@ -2122,8 +2225,11 @@ static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_
     gsf__pack job;
     gsf_buffer raw;
     memset(&raw, 0, sizeof raw);
-    if (version != 2 && version != 3)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d, expected 2 or 3", name, version);
+    if (version < 2 || version > 4)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d, expected 2 to 4", name, version);
+#ifndef GSF_USE_ZSTD
+    if (version == 4) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: SPZ version 4 needs zstd (GSF_USE_ZSTD)", name);
+#endif
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
     job.version = version;
     gsf_result result = gsf__spz_choose_fraction(ctx, &job);
@@ -2141,7 +2247,12 @@ static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_
         raw.data[14] = splats->antialiased ? GSF__SPZ_ANTIALIASED : 0;
         job.arrays = gsf__spz_place((unsigned char*)raw.data, job.count, version);
         gsf__parallel_for(ctx, gsf__codec_chunks(job.count), gsf__spz_encode_chunk, &job);
+#ifdef GSF_USE_ZSTD
+        result = version == 4 ? gsf__spz_append_streams(ctx, name, &job, &raw, out)
+                              : gsf__gzip_append(ctx, name, raw.data, raw.size, out);
+#else
         result = gsf__gzip_append(ctx, name, raw.data, raw.size, out);
+#endif
     }
     gsf_destroy_buffer(ctx, &raw);
     gsf__pack_free(ctx, &job);

@@ -28,8 +28,8 @@ typedef struct option_spec {
 #define AT(field) offsetof(gsfix_options, field)
 #define ALL "info fix render filter path restore metrics masks dataset evaluate"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks dataset evaluate",
-     "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render convert filter path restore masks dataset evaluate",
+     "output folder (convert, path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info render",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
@@ -151,6 +151,7 @@ static const option_spec option_specs[] = {
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
      "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
+    {"--spz-version", INT, AT(spz_version), 2, 4, "N", "convert", "version of a .spz file (default 3; 4 is packed with zstd)"},
     {"--also", TEXT, AT(also), 0, 0, "LIST", "fix",
      "also write OUT/splats.splat (no view-dependent colour), splats.spz, splats.glb: a list of splat, spz, glb"},
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset evaluate",
@@ -195,6 +196,7 @@ enum { OPTION_COUNT = sizeof option_specs / sizeof option_specs[0] };
 
 static int run_info(gsfix_app* app);
 static int run_render(gsfix_app* app);
+static int run_convert(gsfix_app* app);
 static int run_filter(gsfix_app* app);
 static int run_path(gsfix_app* app);
 static int run_restore(gsfix_app* app);
@@ -213,6 +215,8 @@ static const command_spec command_specs[] = {
     {"fix", "SCENE --out DIR", "train splats on photos, repair them, and write a report", 1, gsfix_run_fix},
     {"render", "SPLATS.ply|.splat|.spz|.glb (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
      run_render},
+    {"convert", "SPLATS --out SPLATS2", "write splats in another format: .ply, .splat, .spz or .glb, by the names", 1,
+     run_convert},
     {"filter", "SCENE --out SCENE2", "write a COLMAP model with only the points that the training views see", 1,
      run_filter},
     {"path", "SCENE --out PATH.json", "sample a camera path through a scene", 1, run_path},
@@ -979,6 +983,28 @@ static gsf_result filter_scene(gsfix_app* app) {
 }
 
 static int run_filter(gsfix_app* app) { return filter_scene(app) == GSF_OK ? 0 : gsfix_failed(app); }
+
+// ---- convert ---------------------------------------------------------------------
+
+static gsf_result convert_splats(gsfix_app* app) {
+    gsf_context* ctx = &app->ctx;
+    gsf_splat_save_desc desc = {0};
+    gsf_splats splats;
+    desc.spz_version = app->o.spz_version;
+    gsf_result result = gsf_splat_load(ctx, app->o.inputs[0], &splats);
+    if (result != GSF_OK) return result;
+    result = gsfix_claim_file(app, app->o.out);
+    if (result == GSF_OK) result = gsf_splat_save(ctx, app->o.out, &splats, &desc);
+    if (result == GSF_OK) {
+        gsfix_json_number(ctx, &app->json, "splats", (double)splats.count);
+        gsfix_json_number(ctx, &app->json, "sh_degree", splats.sh_degree);
+        gsfix_print(app, "%zu splats of SH degree %d -> %s", splats.count, (int)splats.sh_degree, app->o.out);
+    }
+    gsf_splat_destroy(ctx, &splats);
+    return result;
+}
+
+static int run_convert(gsfix_app* app) { return convert_splats(app) == GSF_OK ? 0 : gsfix_failed(app); }
 
 // ---- path ------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
-    int clean_iterations, seeds;
+    int clean_iterations, seeds, spz_version;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
     const char** inputs;

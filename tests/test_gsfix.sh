@@ -217,6 +217,13 @@ for file in splats.splat splats.spz splats.glb; do # the same number of splats
     [ "$(grep -o '^splats *[0-9]*' stdout)" = "$(echo "$splats" | grep -o '^splats *[0-9]*')" ] || fail "a/$file has other splats"
     expect 0 "$gsfix" render a/$file --scene "$scene" --max-size 48 --out frames_$file
 done
+expect 0 "$gsfix" convert a/splats.ply --out again.glb
+expect 0 "$gsfix" convert again.glb --out again.ply
+cmp -s a/splats.splat <("$gsfix" convert again.ply --out again.splat > stdout && cat again.splat) || fail "convert: there and back differs"
+expect 1 "$gsfix" convert a/splats.ply --out again.obj
+echo mine > mine.spz
+expect 1 "$gsfix" convert a/splats.ply --out mine.spz
+holds mine mine.spz
 expect 0 "$gsfix" render a/splats.ply --scene "$scene" --max-size 48 --out frames --depth --alpha
 expect 0 "$gsfix" metrics a/test frames --which psnr,ssim_3dgs,ssim_torchmetrics,ssim_skimage --json
 holds '"ssim_skimage":' stdout
