@@ -182,7 +182,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* sp
    with `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers.
    Splats with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An
    opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a
-   file that claims more content than can be compressed into it (DEFLATE: 1032 times its size) is refused in advance. */
+   file that claims more content than can be compressed into it (DEFLATE: 1032 times its size; zstd: 1024 times) is refused
+   in advance. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ, GSF_SPLAT_GLB } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
@@ -1904,15 +1905,6 @@ static gsf__spz_arrays gsf__spz_place(unsigned char* content, size_t count, int 
     return a;
 }
 
-// The sizes of the arrays in bytes.
-static void gsf__spz_array_sizes(size_t count, int version, int degree, size_t sizes[GSF__SPZ_ARRAYS]) {
-    sizes[0] = count * gsf__spz_position_size(version);
-    sizes[1] = count;
-    sizes[2] = sizes[3] = 3 * count;
-    sizes[4] = count * gsf__spz_rotation_size(version);
-    sizes[5] = count * 3 * (size_t)(degree * (degree + 2));
-}
-
 static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
                                      gsf__spz* spz) {
     memset(spz, 0, sizeof *spz);
@@ -1942,7 +1934,15 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
 
 #ifdef GSF_USE_ZSTD
 
-enum { GSF__ZSTD_RATIO = 128 << 10 }; // a block of at most 128 KiB takes a few bytes
+enum { GSF__ZSTD_RATIO = 1024 }; // the most that is believed, as in Niantic's reader; arrays of real splats compress far less
+
+static void gsf__spz_array_sizes(size_t count, int version, int degree, size_t sizes[GSF__SPZ_ARRAYS]) { // in bytes
+    sizes[0] = count * gsf__spz_position_size(version);
+    sizes[1] = count;
+    sizes[2] = sizes[3] = 3 * count;
+    sizes[4] = count * gsf__spz_rotation_size(version);
+    sizes[5] = count * 3 * (size_t)(degree * (degree + 2));
+}
 
 // Reads a file of version 4, as gsf__spz_inflate.
 static gsf_result gsf__spz_read_streams(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
@@ -2769,7 +2769,7 @@ static void gsf__glb_append_json(gsf_context* ctx, const gsf__pack* job, size_t 
     }
     gsf_append_text(ctx, out, "],\"bufferViews\":[");
     for (size_t c = 0, at = 0; c < (size_t)columns; c++) {
-        const size_t row = c == (size_t)columns - 1 ? 8 : 4 * (size_t)gsf__glb_sizes[c < GSF__GLB_SH ? c : GSF__GLB_SH];
+        const size_t row = c == (size_t)columns - 1 ? 8 : 4 * (size_t)gsf__glb_sizes[c < GSF__GLB_SH ? c : (size_t)GSF__GLB_SH];
         gsf_append_text(ctx, out, "%s{\"buffer\":0,\"byteOffset\":%zu,\"byteLength\":%zu,\"target\":34962}", c ? "," : "", at,
                         row * job->count);
         at += row * job->count;
