@@ -26,11 +26,11 @@ typedef struct option_spec {
 } option_spec;
 
 #define AT(field) offsetof(gsfix_options, field)
-#define ALL "info fix render filter path restore metrics masks dataset evaluate"
+#define ALL "info fix render view convert filter path restore metrics masks dataset evaluate"
 static const option_spec option_specs[] = {
     {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render convert filter path restore masks dataset evaluate",
      "output folder (convert, path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
-    {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info render",
+    {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix view filter path masks info render",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
     {"--views", TEXT, AT(views), 0, 0, "3,6,9", "dataset",
@@ -59,7 +59,7 @@ static const option_spec option_specs[] = {
      "hold out every Nth view by name (default 8)"},
     {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
-    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks dataset evaluate",
+    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix view render filter path masks dataset evaluate",
      "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", "fix restore",
      "what repairs the rendered frames (fix: none by default): warp reprojects the photos; mini is a small network that\n"
@@ -113,7 +113,7 @@ static const option_spec option_specs[] = {
      "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate|spread", "fix",
      "camera path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix evaluate", "total number of training steps (default 1200)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix view evaluate", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
      "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
      "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
@@ -151,6 +151,10 @@ static const option_spec option_specs[] = {
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
      "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
+    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]", "view",
+     "what repairs the rendered frames while the scene is trained (default none)"},
+    {"--screenshot", TEXT, AT(screenshot), 0, 0, "FILE.png", "view", "train to the end, save one picture, and leave"},
+    {"--orbit", REAL, AT(orbit), -360, 360, "DEGREES", "view", "with --screenshot: go around this far before"},
     {"--spz-version", INT, AT(spz_version), 2, 4, "N", "convert", "version of a .spz file (default 3; 4 is packed with zstd)"},
     {"--also", TEXT, AT(also), 0, 0, "LIST", "fix",
      "also write OUT/splats.splat (no view-dependent colour), splats.spz, splats.glb: a list of splat, spz, glb"},
@@ -215,6 +219,7 @@ static const command_spec command_specs[] = {
     {"fix", "SCENE --out DIR", "train splats on photos, repair them, and write a report", 1, gsfix_run_fix},
     {"render", "SPLATS.ply|.splat|.spz|.glb (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
      run_render},
+    {"view", "SPLATS | SCENE", "look around splats, or around a scene while it is trained", 1, gsfix_run_view},
     {"convert", "SPLATS --out SPLATS2", "write splats in another format: .ply, .splat, .spz or .glb, by the names", 1,
      run_convert},
     {"filter", "SCENE --out SCENE2", "write a COLMAP model with only the points that the training views see", 1,
@@ -1765,4 +1770,5 @@ int main(int argc, char** argv) { return gsfix_start(argc, argv, NULL); }
 #include "gsfix_tables.c"
 #include "gsfix_tasks.c"
 #include "gsfix_util.c"
+#include "gsfix_view.c"
 #endif

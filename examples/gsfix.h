@@ -18,11 +18,11 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
-    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark;
+    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     int clean_iterations, seeds, spz_version;
-    double restorer_timeout, guidance, guidance_until, strength, block_cache;
+    double restorer_timeout, guidance, guidance_until, strength, block_cache, orbit;
     uint64_t seed;
     const char** inputs;
     int input_count;
@@ -195,6 +195,10 @@ gsf_result gsfix_meter_frame(gsfix_app* app, gsfix_meter* meter, const gsf_image
                              const gsf_image* input);
 double gsfix_read_meter(const gsfix_meter* meter, const char* name); // NaN: not measured
 void gsfix_destroy_meter(gsfix_app* app, gsfix_meter* meter);
+
+// ---- gsfix_view.c ----------------------------------------------------------------
+
+int gsfix_run_view(gsfix_app* app);
 
 // ---- gsfix_tasks.c: commands whose work is a list of tasks ------------------------
 /* A task has a folder of its own, OUT/NAME, with its own manifest and lock, and writes nothing else. What it writes depends

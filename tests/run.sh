@@ -15,7 +15,7 @@ jobs=$(nproc 2> /dev/null || echo 2)
 started=$SECONDS
 
 packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev libzstd-dev
-    libglm-dev libopenimageio-dev libopenmpi-dev openmpi-bin python3)
+    libglm-dev libopenimageio-dev libopenmpi-dev openmpi-bin libsdl2-dev xvfb xauth python3)
 say() { printf '== %s\n' "$*"; }
 
 install_missing() {
