@@ -15449,6 +15449,113 @@ GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* de
 // ---- >>nn metrics ---------------------------------------------------------------
 // Networks that compare images, channels-last as in >>nn convolution. Every score is summed in double.
 
+// ---- metrics: kernels of feature maps
+
+// The products of Winograd's convolution (below), and outputs of a packed panel.
+enum { GSF__WINOGRAD_POINTS = 16 };
+
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_MAPS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_MAPS
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_MAPS
+
+GSF__V_INLINE gsf__vf GSF__V(gsf__v_rectify)(gsf__vf x) { return gsf__v_max(gsf__v_set(0.0f), x); } // a NaN remains
+
+GSF__V_KERNEL void GSF__V(gsf__map_rectify)(const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__v_store_first(y + i, GSF__V(gsf__v_rectify)(gsf__v_load_first(x + i, left)), left);
+    }
+}
+
+// y = max(x, y), where a NaN in either remains
+GSF__V_KERNEL void GSF__V(gsf__map_raise)(const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf a = gsf__v_load_first(x + i, left), b = gsf__v_load_first(y + i, left);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_eq(b, b), gsf__v_max(b, a), b), left);
+    }
+}
+
+// The sum over channels of w (a / |a| - b / |b|)^2 of the rectified features of a pixel, in double.
+GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b, const float* w, int64_t count) {
+    gsf__vd of_a[GSF__HALVES], of_b[GSF__HALVES], sums[GSF__HALVES];
+    for (int h = 0; h < GSF__HALVES; h++) of_a[h] = of_b[h] = sums[h] = gsf__vd_set(0.0);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf x = GSF__V(gsf__v_rectify)(gsf__v_load_first(a + i, left));
+        const gsf__vf y = GSF__V(gsf__v_rectify)(gsf__v_load_first(b + i, left));
+        for (int h = 0; h < GSF__HALVES; h++) {
+            const gsf__vd u = gsf__vd_half(x, h), v = gsf__vd_half(y, h);
+            of_a[h] = gsf__vd_madd(u, u, of_a[h]);
+            of_b[h] = gsf__vd_madd(v, v, of_b[h]);
+        }
+    }
+    double square_a = 0.0, square_b = 0.0, sum = 0.0;
+    for (int h = 0; h < GSF__HALVES; h++) {
+        square_a += gsf__vd_sum(of_a[h]);
+        square_b += gsf__vd_sum(of_b[h]);
+    }
+    const gsf__vd by_a = gsf__vd_set(1.0 / (sqrt(square_a) + 1e-10)), by_b = gsf__vd_set(1.0 / (sqrt(square_b) + 1e-10));
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf x = GSF__V(gsf__v_rectify)(gsf__v_load_first(a + i, left));
+        const gsf__vf y = GSF__V(gsf__v_rectify)(gsf__v_load_first(b + i, left)), of = gsf__v_load_first(w + i, left);
+        for (int h = 0; h < GSF__HALVES; h++) {
+            const gsf__vd d = gsf__vd_half(x, h) * by_a - gsf__vd_half(y, h) * by_b;
+            sums[h] = gsf__vd_madd(gsf__vd_half(of, h) * d, d, sums[h]);
+        }
+    }
+    for (int h = 0; h < GSF__HALVES; h++) sum += gsf__vd_sum(sums[h]);
+    return sum;
+}
+
+// The 16 products' factors from 4 x 4 pixels, which begin at rows[0..3] and are `c` channels apart: v (16, next).
+GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
+    for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
+        const size_t left = (size_t)(c - i);
+#define GSF_X(j)                                                                                                         \
+        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left), b##j = gsf__v_load_first(rows[1] + j * c + i, left); \
+        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left), e##j = gsf__v_load_first(rows[3] + j * c + i, left); \
+        const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+#define GSF_X(k)                                                    \
+        gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
+        gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
+        gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
+        gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+    }
+}
+
+// 2 x 2 pixels of n outputs from the products m (16, next) and the bias: y[0..3], NULL for a pixel beyond the border.
+GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, const float* bias, int64_t n,
+                                                float* const y[4]) {
+    for (int64_t i = 0; i < n; i += GSF__LANES, m += GSF__LANES) {
+        const size_t left = (size_t)(n - i);
+        const gsf__vf b = gsf__v_load_first(bias + i, left);
+#define GSF_X(k)                                                                                                 \
+        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);                  \
+        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next);           \
+        const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+        gsf__v_store_first(y[0] + i, ((t0 + t1) + t2) + b, left);
+        if (y[1]) gsf__v_store_first(y[1] + i, ((t1 - t2) - t3) + b, left);
+        if (y[2]) gsf__v_store_first(y[2] + i, ((u0 + u1) + u2) + b, left);
+        if (y[3]) gsf__v_store_first(y[3] + i, ((u1 - u2) - u3) + b, left);
+    }
+}
+
+#endif // GSF__KERNELS_MAPS
+#ifndef GSF__ISA
+
 // ---- metrics: layers of feature maps
 
 typedef struct gsf__map { // (images, height, width, channels)
@@ -15462,17 +15569,36 @@ static size_t gsf__map_count(const gsf__map* map) {
                            gsf__nn_product((size_t)map->width, (size_t)map->channels));
 }
 
+typedef struct gsf__map_packed { // weights of a convolution
+    const void* key;             // where they are in their file
+    float* packed;
+} gsf__map_packed;
+
+typedef struct gsf__map_layers { // a network's convolutions
+    gsf__nn_workspace scratch;   // bordered input, products
+    gsf__map_packed* packed;     // weights, packed when their layer first runs
+    size_t count, room;
+} gsf__map_layers;
+
+static void gsf__destroy_map_layers(gsf_context* ctx, gsf__map_layers* layers) {
+    for (size_t i = 0; i < layers->count; i++) gsf_free(ctx, layers->packed[i].packed);
+    gsf_free(ctx, layers->packed);
+    gsf__nn_destroy_workspace(ctx, &layers->scratch);
+    memset(layers, 0, sizeof *layers);
+}
+
 typedef struct gsf__maps { // buffers of a network, reused from image to image
     gsf_context* ctx;
-    gsf__nn_workspace rooms[2], conv; // the maps that a layer reads and writes; its weights and bordered input
-    int room;                         // that of the current map
+    gsf__nn_workspace rooms[2]; // the maps that a layer reads and writes
+    gsf__map_layers layers;
+    int room;                   // that of the current map
     gsf__map now;
 } gsf__maps;
 
 static void gsf__destroy_maps(gsf_context* ctx, gsf__maps* maps) {
     gsf__nn_destroy_workspace(ctx, &maps->rooms[0]);
     gsf__nn_destroy_workspace(ctx, &maps->rooms[1]);
-    gsf__nn_destroy_workspace(ctx, &maps->conv);
+    gsf__destroy_map_layers(ctx, &maps->layers);
 }
 
 // Gives `map` the memory of the room that the current map does not use.
@@ -15491,7 +15617,7 @@ typedef struct gsf__map_fill { // the input, dense and with `pad` columns of zer
     const gsf__map* x;
     float* out;
     int64_t image, pad;
-    int rectify; // ReLU
+    void (*rectify)(const float* x, int64_t count, float* y); // ReLU, or NULL
 } gsf__map_fill;
 
 static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
@@ -15504,9 +15630,11 @@ static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
     memset(out, 0, (size_t)edge * sizeof(float));
     memset(out + edge + count, 0, (size_t)edge * sizeof(float));
     out += edge;
-    for (int64_t i = 0; i < (map->pitch == c ? 1 : map->width); i++)
-        memcpy(out + i * c, x + i * map->pitch, (size_t)(map->pitch == c ? count : c) * sizeof(float));
-    for (int64_t i = 0; i < count && job->rectify; i++) out[i] = out[i] < 0.0f ? 0.0f : out[i]; // a NaN remains
+    const int64_t runs = map->pitch == c ? 1 : map->width, length = map->pitch == c ? count : c;
+    for (int64_t i = 0; i < runs; i++, x += map->pitch, out += c) {
+        if (job->rectify) job->rectify(x, length, out);
+        else memcpy(out, x, (size_t)length * sizeof(float));
+    }
 }
 
 typedef struct gsf__map_conv { // a convolution; kernel and channels are those of the weight
@@ -15515,20 +15643,201 @@ typedef struct gsf__map_conv { // a convolution; kernel and channels are those o
     int rectify;              // ReLU of the input
     int64_t above, left;      // rows before and columns within the padded input at which output 0 begins
     int64_t ldo, out_row;     // floats from pixel to pixel, and from row to row, of the output
+    const void* key;          // of the packed weights
 } gsf__map_conv;
 
+/* A convolution by 3 x 3 at stride 1 takes 4 instead of 9 products per value, input and output channel by Winograd's
+   F(2 x 2, 3 x 3) (Lavin and Gray 2016): with d, a tile of 4 x 4 pixels whose corners are 2 apart, and g, the kernel,
+
+       2 x 2 outputs = A' ((G g G') * (B' d B)) A      G = 1   0   0     B' = 1  0 -1  0     A' = 1  1  1  0
+                                                           .5  .5 .5          0  1  1  0          0  1 -1 -1
+                                                           .5 -.5 .5          0 -1  1  0
+                                                           0   0   1          0  1  0 -1
+   where * multiplies point by point and adds up over input channels. Each of the 16 points is a matrix product of its own,
+   tiles by channels by outputs. Work is divided into segments of up to 240 tiles, which hold all factors and products of
+   their tiles: weights, (16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so that rounding
+   errors stay those of a sum of products. */
+
+enum { GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // of a segment; a multiple of the pixels per product
+       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that a segment may hold beyond the least number of tiles
+
+static int64_t gsf__winograd_packed(const gsf__conv_layer* layer) { // floats: biases, weights
+    return gsf__conv_blocks(layer) * GSF__CONV_N * (1 + GSF__WINOGRAD_POINTS * layer->in);
+}
+
+static void gsf__winograd_pack_block(void* arg, size_t block, int32_t worker) { // sixteen outputs
+    static const double g[4][3] = {{1.0, 0.0, 0.0}, {0.5, 0.5, 0.5}, {0.5, -0.5, 0.5}, {0.0, 0.0, 1.0}};
+    const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
+    const gsf__conv_layer* layer = job->layer;
+    const int64_t first = (int64_t)block * GSF__CONV_N, n_end = gsf__least(layer->out - first, GSF__CONV_N);
+    const int64_t panel = GSF__CONV_N * layer->in, blocks = gsf__conv_blocks(layer);
+    float *bias = job->out + first, *to = job->out + blocks * GSF__CONV_N + (int64_t)block * panel;
+    (void)worker;
+    memset(bias, 0, GSF__CONV_N * sizeof(float));
+    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, bias);
+    for (int64_t c = 0; c < layer->in; c++)
+        for (int64_t n = 0; n < GSF__CONV_N; n++) {
+            float values[9] = {0};
+            double rows[4][3];
+            if (n < n_end) gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c) * 9, 9, values);
+            for (int i = 0; i < 4; i++)
+                for (int x = 0; x < 3; x++)
+                    rows[i][x] = g[i][0] * (double)values[x] + g[i][1] * (double)values[3 + x] + g[i][2] * (double)values[6 + x];
+            for (int p = 0; p < GSF__WINOGRAD_POINTS; p++)
+                to[p * blocks * panel + c * GSF__CONV_N + n] =
+                    (float)(rows[p / 4][0] * g[p % 4][0] + rows[p / 4][1] * g[p % 4][1] + rows[p / 4][2] * g[p % 4][2]);
+        }
+}
+
+typedef struct gsf__winograd_job { // of one image
+    const gsf__conv_kernels* kernels;
+    void (*spread)(const float* const rows[4], int64_t c, float* v, int64_t next);
+    void (*gather)(const float* m, int64_t next, const float* bias, int64_t n, float* const y[4]);
+    const float *x, *zeros;        // the bordered image; four pixels
+    const float *bias, *weights;
+    int64_t in, out, blocks;       // channels; panels of 16 outputs
+    int64_t height, width, across; // across: tiles
+    int64_t tiles, segment;        // of the image; of a segment
+    float* y;
+    int64_t ldo, out_row;
+    float* workers;
+    size_t per_worker;             // floats: factors (16, segment, in), products (16, blocks, segment, 16)
+} gsf__winograd_job;
+
+static void gsf__winograd_multiply(const gsf__winograd_job* job, int64_t count, const float* v, float* m) {
+    const int64_t panel = job->in * GSF__CONV_N, sums = job->segment * GSF__CONV_N;
+    for (int64_t p = 0; p < GSF__WINOGRAD_POINTS; p++, v += job->segment * job->in)
+        for (int64_t block = 0, step; block < job->blocks; block += step, m += step * sums) {
+            const float* b = job->weights + (p * job->blocks + block) * panel;
+            step = job->kernels->multiply_two && block + 1 < job->blocks ? 2 : 1;
+            memset(m, 0, (size_t)(step * sums) * sizeof(float));
+            for (int64_t k0 = 0; k0 < job->in; k0 += GSF__CONV_K) {
+                const int64_t k = gsf__least(job->in - k0, GSF__CONV_K);
+                const float *panels = b + k0 * GSF__CONV_N, *ahead = panels + step * k * GSF__CONV_N;
+                if (step == 2)
+                    job->kernels->multiply_two(v + k0, job->in, count, panels, panel, k, m, sums, ahead);
+                else job->kernels->multiply(v + k0, job->in, count, panels, k, m, ahead);
+            }
+        }
+}
+
+static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
+    const gsf__winograd_job* job = (const gsf__winograd_job*)arg;
+    const int64_t first = (int64_t)segment * job->segment, count = gsf__least(job->tiles - first, job->segment);
+    const int64_t row = (job->width + 2) * job->in, next = job->blocks * job->segment * GSF__CONV_N;
+    float* v = job->workers + (size_t)worker * job->per_worker;
+    float* m = v + GSF__WINOGRAD_POINTS * job->segment * job->in;
+    for (int64_t t = 0; t < count; t++) {
+        const int64_t y = (first + t) / job->across * 2 - 1, x = (first + t) % job->across * 2;
+        const float* rows[4];
+        for (int64_t i = 0; i < 4; i++)
+            rows[i] = y + i < 0 || y + i >= job->height ? job->zeros : job->x + (y + i) * row + x * job->in;
+        job->spread(rows, job->in, v + t * job->in, job->segment * job->in);
+    }
+    gsf__winograd_multiply(job, count, v, m);
+    for (int64_t block = 0; block < job->blocks; block++)
+        for (int64_t t = 0; t < count; t++) {
+            const int64_t y = (first + t) / job->across * 2, x = (first + t) % job->across * 2, n0 = block * GSF__CONV_N;
+            float* to = job->y + y * job->out_row + x * job->ldo + n0;
+            const int right = x + 1 < job->width, below = y + 1 < job->height;
+            float* const pixels[4] = {to, right ? to + job->ldo : NULL, below ? to + job->out_row : NULL,
+                                      right && below ? to + job->out_row + job->ldo : NULL};
+            job->gather(m + (block * job->segment + t) * GSF__CONV_N, next, job->bias + n0,
+                        gsf__least(job->out - n0, GSF__CONV_N), pixels);
+        }
+}
+
+// Tiles of a segment: as many as fit.
+static int64_t gsf__winograd_tiles(const gsf__conv_layer* layer, int64_t tiles) {
+    const int64_t each = GSF__WINOGRAD_POINTS * (layer->in + gsf__conv_blocks(layer) * GSF__CONV_N);
+    int64_t most = GSF__WINOGRAD_ROOM / each / GSF__WINOGRAD_STEP * GSF__WINOGRAD_STEP;
+    if (most < GSF__WINOGRAD_STEP) most = GSF__WINOGRAD_STEP;
+    return gsf__even_piece(tiles, gsf__least(most, GSF__WINOGRAD_TILES), GSF__WINOGRAD_STEP);
+}
+
+// Where it pays: with few channels the sums of the tiles take longer than the products that they save.
+static int gsf__is_winograd(const gsf__map_conv* c, const gsf__conv_layer* layer, const gsf__map* x, const gsf__map* y) {
+    return layer->kernel == 3 && c->stride == 1 && c->pad == 1 && c->above == 1 && c->left == 0 && x->height == y->height &&
+           x->width == y->width && layer->in >= 16 && layer->out >= 16;
+}
+
+static float* gsf__map_find_packed(const gsf__map_layers* layers, const void* key) { // NULL: not packed yet
+    for (size_t i = 0; i < layers->count; i++)
+        if (layers->packed[i].key == key) return layers->packed[i].packed;
+    return NULL;
+}
+
+// The weights of a layer, packed for `winograd` or not; NULL when out of memory.
+static const float* gsf__map_pack(gsf_context* ctx, gsf__map_layers* layers, const gsf__conv_layer* layer, const void* key,
+                                  int winograd) {
+    gsf__conv_pack_job job = {layer, gsf__map_find_packed(layers, key)};
+    if (job.out) return job.out;
+    const size_t count = (size_t)(winograd ? gsf__winograd_packed(layer) : gsf__conv_packed(layer));
+    if (gsf__reserve(ctx, (void**)&layers->packed, &layers->room, layers->count, layers->count + 1, sizeof *layers->packed))
+        return NULL;
+    job.out = (float*)gsf_alloc(ctx, count, sizeof(float));
+    if (!job.out) return NULL;
+    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), winograd ? gsf__winograd_pack_block : gsf__conv_pack_block, &job);
+    layers->packed[layers->count].key = key;
+    layers->packed[layers->count++].packed = job.out;
+    return job.out;
+}
+
+static void gsf__map_winograd(gsf_context* ctx, const gsf__map_conv* c, const gsf__conv_layer* layer, const float* packed,
+                              gsf__map_fill* fill, float* workers, const gsf__map* y) {
+    gsf__winograd_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
+    job.spread = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_spread);
+    job.gather = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_gather);
+    job.in = layer->in;
+    job.out = layer->out;
+    job.blocks = gsf__conv_blocks(layer);
+    job.height = y->height;
+    job.width = y->width;
+    job.across = (y->width + 1) / 2;
+    job.tiles = job.across * ((y->height + 1) / 2);
+    job.segment = gsf__winograd_tiles(layer, job.tiles);
+    job.x = fill->out;
+    job.bias = packed;
+    job.weights = packed + job.blocks * GSF__CONV_N;
+    job.ldo = c->ldo;
+    job.out_row = c->out_row;
+    job.workers = workers;
+    job.per_worker = (size_t)(GSF__WINOGRAD_POINTS * job.segment * (job.in + job.blocks * GSF__CONV_N));
+    float* zeros = fill->out + y->height * (y->width + 2) * job.in; // also right of the last row, in a tile cut by the border
+    memset(zeros, 0, (size_t)(4 * job.in) * sizeof(float));
+    job.zeros = zeros;
+    for (; fill->image < fill->x->images; fill->image++) {
+        gsf__parallel_for(ctx, (size_t)y->height, gsf__map_fill_row, fill);
+        job.y = y->data + fill->image * y->height * y->width * y->pitch;
+        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.tiles, job.segment), gsf__winograd_segment, &job);
+    }
+}
+
 // Writes y, of the sizes given there; y may be a part of x.
-static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__map_conv* c,
-                                       const gsf__map* x, const gsf__map* y) {
+static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__map_layers* layers, const gsf__map_conv* c, const gsf__map* x,
+                                       const gsf__map* y) {
     const gsf_nn_tensor* w = c->layer->weight;
     gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2]};
-    const int64_t across = x->width + 2 * c->pad, bordered = x->height * across * layer.in;
-    float* memory = (float*)gsf__nn_scratch(ctx, workspace,
-                                            ((size_t)gsf__conv_packed(&layer) + (size_t)bordered) * sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    const int64_t across = x->width + 2 * c->pad;
+    const int winograd = gsf__is_winograd(c, &layer, x, y);
+    size_t floats = (size_t)(x->height * across * layer.in);
+    if (winograd) {
+        const int64_t segment = gsf__winograd_tiles(&layer, (y->width + 1) / 2 * ((y->height + 1) / 2));
+        floats += (size_t)(4 * layer.in) + (size_t)ctx->parallel.worker_count * (size_t)(GSF__WINOGRAD_POINTS * segment) *
+                                               (size_t)(layer.in + gsf__conv_blocks(&layer) * GSF__CONV_N);
+    }
+    float* memory = (float*)gsf__nn_scratch(ctx, &layers->scratch, floats * sizeof(float));
+    const float* packed = memory ? gsf__map_pack(ctx, layers, &layer, c->key, winograd) : NULL;
+    if (!packed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__map_fill fill = {x, memory, 0, c->pad, NULL};
+    if (c->rectify) fill.rectify = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__map_rectify);
+    if (winograd) {
+        gsf__map_winograd(ctx, c, &layer, packed, &fill, memory + x->height * across * layer.in + 4 * layer.in, y);
+        return GSF_OK;
+    }
     gsf__conv_job job;
-    gsf__map_fill fill = {x, memory, 0, c->pad, c->rectify};
-    gsf__conv_pack(ctx, &layer, memory + bordered);
     memset(&job, 0, sizeof job);
     job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
     job.in[0] = memory;
@@ -15541,7 +15850,7 @@ static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* work
     job.k = layer.kernel * layer.in;
     job.stride = c->stride;
     job.pad = c->above;
-    job.packed = memory + bordered;
+    job.packed = packed;
     job.panel = gsf__conv_panel(&layer);
     job.height = y->height;
     job.width = y->width;
@@ -15557,10 +15866,10 @@ static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* work
     return GSF_OK;
 }
 
-static gsf_result gsf__map_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_layer* layer,
-                                    int64_t stride, int64_t pad, int rectify, const gsf__map* x, const gsf__map* y) {
-    const gsf__map_conv c = {layer, stride, pad, rectify, pad, 0, y->pitch, y->width * y->pitch};
-    return gsf__map_convolve_at(ctx, workspace, &c, x, y);
+static gsf_result gsf__map_convolve(gsf_context* ctx, gsf__map_layers* layers, const gsf__nn_layer* layer, int64_t stride,
+                                    int64_t pad, int rectify, const gsf__map* x, const gsf__map* y) {
+    const gsf__map_conv c = {layer, stride, pad, rectify, pad, 0, y->pitch, y->width * y->pitch, layer->weight->data};
+    return gsf__map_convolve_at(ctx, layers, &c, x, y);
 }
 
 // Convolves the current map into a new one, which becomes the current one.
@@ -15572,7 +15881,7 @@ static gsf_result gsf__map_conv_next(gsf__maps* maps, const gsf__nn_layer* layer
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "%s: %lld x %lld values are too few", w->name,
                         (long long)maps->now.width, (long long)maps->now.height);
     GSF__TRY(gsf__map_make(maps, &y));
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, layer, stride, pad, rectify, &maps->now, &y));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, layer, stride, pad, rectify, &maps->now, &y));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -15695,6 +16004,7 @@ static void gsf__lpips_close(gsf_context* ctx, void* state) {
 typedef struct gsf__map_pool_job {
     const gsf__map *x, *y;
     int64_t kernel;
+    void (*raise)(const float* x, int64_t count, float* y);
 } gsf__map_pool_job;
 
 static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima of windows, 2 apart, cut at the border
@@ -15710,8 +16020,7 @@ static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima
             for (int64_t u = x0; u < x1; u++) {
                 const float* from = x->data + ((image * x->height + v) * x->width + u) * c;
                 if (v == y0 && u == x0) memcpy(out, from, (size_t)c * sizeof(float));
-                else
-                    for (int64_t i = 0; i < c; i++) out[i] = from[i] <= out[i] ? out[i] : from[i]; // a NaN remains
+                else job->raise(from, c, out);
             }
     }
 }
@@ -15726,7 +16035,7 @@ static gsf_result gsf__map_pool_next(gsf__maps* maps, int64_t kernel, int up) {
     const gsf__map x = maps->now;
     gsf__map y = {NULL, x.images, gsf__pool_size(x.height, kernel, up), gsf__pool_size(x.width, kernel, up), x.channels,
                   x.channels};
-    gsf__map_pool_job job = {&x, &y, kernel};
+    gsf__map_pool_job job = {&x, &y, kernel, GSF__WIDE_KERNEL_OF(maps->ctx->cpu_level, gsf__map_raise)};
     if (y.height < 1 || y.width < 1)
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "max pool: %lld x %lld values are too few", (long long)x.width,
                         (long long)x.height);
@@ -15744,9 +16053,9 @@ static gsf_result gsf__lpips_fire(gsf__maps* maps, const gsf__nn_layer* layers) 
     y.channels = y.pitch = one + three;
     GSF__TRY(gsf__map_make(maps, &y));
     gsf__map part = y;
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[1], 1, 0, 1, &maps->now, &part));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, &layers[1], 1, 0, 1, &maps->now, &part));
     part.data += one;
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[2], 1, 1, 1, &maps->now, &part));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, &layers[2], 1, 1, 1, &maps->now, &part));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -15755,16 +16064,8 @@ typedef struct gsf__lpips_tap_job {
     const gsf__map* map; // of two images
     const float* weights;
     double* partial;     // (height)
+    double (*distance)(const float* a, const float* b, const float* w, int64_t count);
 } gsf__lpips_tap_job;
-
-static double gsf__lpips_norm(const float* x, int64_t count) { // of the rectified features
-    double sums[4] = {0.0, 0.0, 0.0, 0.0};
-    for (int64_t i = 0; i < count; i++) {
-        const double v = x[i] < 0.0f ? 0.0 : (double)x[i];
-        sums[i & 3] += v * v;
-    }
-    return sqrt(sums[0] + sums[1] + (sums[2] + sums[3])) + 1e-10;
-}
 
 static void gsf__lpips_tap_row(void* arg, size_t row, int32_t worker) {
     const gsf__lpips_tap_job* job = (const gsf__lpips_tap_job*)arg;
@@ -15772,15 +16073,7 @@ static void gsf__lpips_tap_row(void* arg, size_t row, int32_t worker) {
     const float *a = job->map->data + (int64_t)row * width * c, *b = a + job->map->height * width * c;
     double sum = 0.0;
     (void)worker;
-    for (int64_t x = 0; x < width; x++, a += c, b += c) {
-        const double of_a = 1.0 / gsf__lpips_norm(a, c), of_b = 1.0 / gsf__lpips_norm(b, c);
-        double sums[4] = {0.0, 0.0, 0.0, 0.0};
-        for (int64_t i = 0; i < c; i++) {
-            const double d = (a[i] < 0.0f ? 0.0 : (double)a[i]) * of_a - (b[i] < 0.0f ? 0.0 : (double)b[i]) * of_b;
-            sums[i & 3] += (double)job->weights[i] * d * d;
-        }
-        sum += sums[0] + sums[1] + (sums[2] + sums[3]);
-    }
+    for (int64_t x = 0; x < width; x++, a += c, b += c) sum += job->distance(a, b, job->weights, c);
     job->partial[row] = sum;
 }
 
@@ -15791,7 +16084,7 @@ static gsf_result gsf__lpips_measure_tap(gsf__lpips* net, const gsf_nn_tensor* w
     GSF__TRY(gsf__reserve(ctx, (void**)&net->partial, &net->partial_room, 0, (size_t)map->height, sizeof(double)));
     GSF__TRY(gsf__reserve(ctx, (void**)&net->vectors, &net->vectors_room, 0, (size_t)weight->count, sizeof(float)));
     gsf_nn_convert_tensor(weight, 0, weight->count, net->vectors);
-    gsf__lpips_tap_job job = {map, net->vectors, net->partial};
+    gsf__lpips_tap_job job = {map, net->vectors, net->partial, GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__lpips_distance)};
     gsf__parallel_for(ctx, (size_t)map->height, gsf__lpips_tap_row, &job);
     double sum = 0.0;
     for (int64_t i = 0; i < map->height; i++) sum += net->partial[i];
@@ -16256,7 +16549,8 @@ typedef struct gsf__amt {
     gsf__amt_conv merge[2];
     gsf_context* ctx;
     const gsf__nn_tap* tap;
-    gsf__nn_workspace conv, rooms[GSF__AMT_ROOMS]; // maps in the order of their making, reused by the next pair
+    gsf__map_layers layers;
+    gsf__nn_workspace rooms[GSF__AMT_ROOMS]; // maps in the order of their making, reused by the next pair
     int room;
     // the stream
     gsf_image even, odd, middle; // the last frame of even number, the one after it (u8), and that as it should be
@@ -16474,41 +16768,50 @@ static gsf_result gsf__amt_convolve(gsf__amt* net, const gsf__amt_conv* layer, i
     const int64_t pad = layer->conv.weight->shape[2] / 2, over = 2 * pad - layer->conv.weight->shape[2];
     GSF__TRY(gsf__amt_make(net, x->images, (x->height + over) / stride + 1, (x->width + over) / stride + 1,
                            layer->conv.weight->shape[0], y));
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &layer->conv, stride, pad, 0, x, y));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &layer->conv, stride, pad, 0, x, y));
     return layer->slope ? gsf__amt_activate(net, layer->slope, 0.0f, y) : GSF_OK;
 }
 
 // The same in place or into an existing map, at stride 1; `leak` is the slope of a LeakyReLU, 1: none
 static gsf_result gsf__amt_convolve_to(gsf__amt* net, const gsf__nn_layer* layer, float leak, const gsf__map* x,
                                        const gsf__map* y) {
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, layer, 1, layer->weight->shape[2] / 2, 0, x, y));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, layer, 1, layer->weight->shape[2] / 2, 0, x, y));
     return leak != 1.0f ? gsf__amt_activate(net, NULL, leak, y) : GSF_OK;
+}
+
+// The weights (out, in, 2, 2) of the convolution that gives the pixels of one parity; w: scratch, (16 in out)
+static void gsf__amt_quarter(const gsf_nn_tensor* weight, int64_t py, int64_t px, float* w, float* quarter) {
+    const int64_t in = weight->shape[0], out = weight->shape[1];
+    gsf_nn_convert_tensor(weight, 0, 16 * in * out, w);
+    for (int64_t o = 0; o < out; o++)
+        for (int64_t i = 0; i < in; i++)
+            for (int64_t k = 0; k < 4; k++) // rows before and at the output's (parity 0), or at and after it
+                *quarter++ = w[(i * out + o) * 16 + (3 - py - 2 * (k / 2)) * 4 + (3 - px - 2 * (k % 2))];
 }
 
 // ConvTranspose2d(4, stride 2, padding 1): for each parity of the output's row and column a 2 x 2 convolution.
 static gsf_result gsf__amt_up(gsf__amt* net, const gsf__nn_layer* layer, const gsf__map* x, const gsf__map* y) {
     const int64_t in = layer->weight->shape[0], out = layer->weight->shape[1], shape[4] = {out, in, 2, 2};
-    float* parts = (float*)gsf_alloc(net->ctx, (size_t)(16 * in * out), 2 * sizeof(float));
-    gsf_result result = parts ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    if (!result) gsf_nn_convert_tensor(layer->weight, 0, 16 * in * out, parts + 16 * in * out);
+    gsf_result result = GSF_OK;
     for (int64_t parity = 0; parity < 4 && !result; parity++) {
         const int64_t py = parity / 2, px = parity % 2;
-        float* w = parts + parity * 4 * in * out;
-        for (int64_t o = 0; o < out; o++)
-            for (int64_t i = 0; i < in; i++)
-                for (int64_t k = 0; k < 4; k++) // rows before and at the output's (parity 0), or at and after it
-                    w[(o * in + i) * 4 + k] = parts[16 * in * out + (i * out + o) * 16 + (3 - py - 2 * (k / 2)) * 4 +
-                                                    (3 - px - 2 * (k % 2))];
+        const char* key = (const char*)layer->weight->data + parity; // each has an address in the tensor for itself
+        float* w = NULL;
+        if (!gsf__map_find_packed(&net->layers, key)) {
+            w = (float*)gsf_alloc(net->ctx, (size_t)(in * out), 20 * sizeof(float));
+            if (!w) return GSF_ERROR_OUT_OF_MEMORY;
+            gsf__amt_quarter(layer->weight, py, px, w + 4 * in * out, w);
+        }
         const gsf_nn_tensor weight = gsf_nn_wrap_tensor(layer->weight->name, w, 4, shape);
         const gsf__nn_layer quarter = {&weight, layer->bias};
         gsf__map part = *y;
         part.data += (py * y->width + px) * y->pitch;
         part.height = x->height;
         part.width = x->width;
-        const gsf__map_conv c = {&quarter, 1, 1, 0, 1 - py, px, 2 * y->pitch, 2 * y->width * y->pitch};
-        result = gsf__map_convolve_at(net->ctx, &net->conv, &c, x, &part);
+        const gsf__map_conv c = {&quarter, 1, 1, 0, 1 - py, px, 2 * y->pitch, 2 * y->width * y->pitch, key};
+        result = gsf__map_convolve_at(net->ctx, &net->layers, &c, x, &part);
+        gsf_free(net->ctx, w);
     }
-    gsf_free(net->ctx, parts);
     return result ? result : gsf__check_cancel(net->ctx);
 }
 
@@ -16542,11 +16845,11 @@ static gsf_result gsf__amt_decode(gsf__amt* net, const gsf__amt_decoder* d, cons
             b = c;
             continue;
         }
-        GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[i].conv, 1, 1, 0, &part, &part));
+        GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &d->convs[i].conv, 1, 1, 0, &part, &part));
         GSF__TRY(gsf__amt_activate(net, d->convs[i].slope, 0.0f, &part));
     }
     GSF__TRY(gsf__amt_make(net, 1, b.height, b.width, b.channels, &c));
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[4].conv, 1, 1, 0, &b, &c));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &d->convs[4].conv, 1, 1, 0, &b, &c));
     gsf__amt_add(net, &a, &c);
     GSF__TRY(gsf__amt_activate(net, d->convs[4].slope, 0.0f, &c));
     return gsf__amt_up(net, &d->up, &c, y);
@@ -16957,7 +17260,7 @@ static gsf_result gsf__amt_open(gsf_context* ctx, const gsf_nn_metric* metric, v
 static void gsf__amt_close(gsf_context* ctx, void* state) {
     gsf__amt* net = (gsf__amt*)state;
     for (int i = 0; i < GSF__AMT_ROOMS; i++) gsf__nn_destroy_workspace(ctx, &net->rooms[i]);
-    gsf__nn_destroy_workspace(ctx, &net->conv);
+    gsf__destroy_map_layers(ctx, &net->layers);
     gsf_destroy_image(ctx, &net->even);
     gsf_destroy_image(ctx, &net->odd);
     gsf_destroy_image(ctx, &net->middle);
