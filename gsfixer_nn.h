@@ -15481,6 +15481,88 @@ GSF__V_KERNEL void GSF__V(gsf__map_raise)(const float* x, int64_t count, float* 
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__map_add)(const float* x, int64_t count, float* y) { // y += x
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__v_store_first(y + i, gsf__v_load_first(y + i, left) + gsf__v_load_first(x + i, left), left);
+    }
+}
+
+// y *= slope where y < 0; slopes: per channel, NULL: `leak` for all
+GSF__V_KERNEL void GSF__V(gsf__map_leak)(const float* slopes, float leak, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf v = gsf__v_load_first(y + i, left);
+        const gsf__vf slope = slopes ? gsf__v_load_first(slopes + i, left) : gsf__v_set(leak);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_lt(v, gsf__v_set(0.0f)), v * slope, v), left);
+    }
+}
+
+// y = (y - mean) * factor, then as gsf__map_leak. means: (2, channels) whose sum is the mean, so that subtracting a mean that
+// is large beside the deviation costs no digits
+GSF__V_KERNEL void GSF__V(gsf__map_scale)(const float* means, const float* factors, float leak, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf above = gsf__v_load_first(y + i, left) - gsf__v_load_first(means + i, left);
+        const gsf__vf v = (above - gsf__v_load_first(means + count + i, left)) * gsf__v_load_first(factors + i, left);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_lt(v, gsf__v_set(0.0f)), v * gsf__v_set(leak), v), left);
+    }
+}
+
+// The sum and the sum of squares of each channel of `pixels` pixels: sums (channels rounded up to whole vectors, 2)
+GSF__V_KERNEL void GSF__V(gsf__map_moments)(const float* x, int64_t pixels, int64_t channels, int64_t pitch, double* sums) {
+    for (int64_t c = 0; c < channels; c += GSF__LANES) {
+        const size_t left = (size_t)(channels - c);
+        gsf__vd sum[GSF__HALVES], square[GSF__HALVES];
+        for (int h = 0; h < GSF__HALVES; h++) sum[h] = square[h] = gsf__vd_set(0.0);
+        for (int64_t i = 0; i < pixels; i++) {
+            const gsf__vf v = gsf__v_load_first(x + i * pitch + c, left);
+            for (int h = 0; h < GSF__HALVES; h++) {
+                const gsf__vd d = gsf__vd_half(v, h);
+                sum[h] = sum[h] + d;
+                square[h] = gsf__vd_madd(d, d, square[h]);
+            }
+        }
+        double a[GSF__LANES], b[GSF__LANES];
+        memcpy(a, sum, sizeof a);
+        memcpy(b, square, sizeof b);
+        for (int i = 0; i < GSF__LANES; i++, sums += 2) {
+            sums[0] = a[i];
+            sums[1] = b[i];
+        }
+    }
+}
+
+// y = by * the bilinear mix of four pixels at the shares u and v of their second column and row
+GSF__V_KERNEL void GSF__V(gsf__map_mix)(const float* const corners[4], float u, float v, float by, int64_t count, float* y) {
+    const gsf__vf across = gsf__v_set(u), down = gsf__v_set(v), factor = gsf__v_set(by);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf a = gsf__v_load_first(corners[0] + i, left), b = gsf__v_load_first(corners[1] + i, left);
+        const gsf__vf c = gsf__v_load_first(corners[2] + i, left), d = gsf__v_load_first(corners[3] + i, left);
+        const gsf__vf top = gsf__v_madd(b - a, across, a), bottom = gsf__v_madd(d - c, across, c);
+        gsf__v_store_first(y + i, factor * gsf__v_madd(bottom - top, down, top), left);
+    }
+}
+
+// The product of a pixel with each of `pixels` others, `pitch` apart
+GSF__V_KERNEL void GSF__V(gsf__map_products)(const float* from, const float* to, int64_t pixels, int64_t pitch, int64_t count,
+                                             float scale, float* out) {
+    for (int64_t p = 0; p < pixels; p++, to += pitch) {
+        gsf__vf sum = gsf__v_set(0.0f), other = sum;
+        int64_t i = 0;
+        for (; i + 2 * GSF__LANES <= count; i += 2 * GSF__LANES) {
+            sum = gsf__v_madd(gsf__v_load(from + i), gsf__v_load(to + i), sum);
+            other = gsf__v_madd(gsf__v_load(from + i + GSF__LANES), gsf__v_load(to + i + GSF__LANES), other);
+        }
+        for (; i < count; i += GSF__LANES) {
+            const size_t left = (size_t)(count - i);
+            sum = gsf__v_madd(gsf__v_load_first(from + i, left), gsf__v_load_first(to + i, left), sum);
+        }
+        out[p] = scale * gsf__v_sum(sum + other);
+    }
+}
+
 // The sum over channels of w (a / |a| - b / |b|)^2 of the rectified features of a pixel, in double.
 GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b, const float* w, int64_t count) {
     gsf__vd of_a[GSF__HALVES], of_b[GSF__HALVES], sums[GSF__HALVES];
@@ -16584,35 +16666,70 @@ static gsf__map gsf__map_image(const gsf__map* map, int64_t index) {
     return image;
 }
 
+typedef struct gsf__map_kernels {
+    void (*add)(const float* x, int64_t count, float* y);
+    void (*leak)(const float* slopes, float leak, int64_t count, float* y);
+    void (*scale)(const float* means, const float* factors, float leak, int64_t count, float* y);
+    void (*moments)(const float* x, int64_t pixels, int64_t channels, int64_t pitch, double* sums);
+    void (*mix)(const float* const corners[4], float u, float v, float by, int64_t count, float* y);
+    void (*products)(const float* from, const float* to, int64_t pixels, int64_t pitch, int64_t count, float scale, float* out);
+} gsf__map_kernels;
+
+static const gsf__map_kernels* gsf__map_kernels_of(gsf_cpu_level level) {
+#define GSF_X(isa)                                                                                                       \
+    static const gsf__map_kernels isa = {gsf__map_add_##isa, gsf__map_leak_##isa, gsf__map_scale_##isa,                  \
+                                         gsf__map_moments_##isa, gsf__map_mix_##isa, gsf__map_products_##isa}
+    GSF_X(scalar);
+#if GSF__X86
+    GSF_X(avx2);
+    GSF_X(avx512);
+    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+#undef GSF_X
+    (void)level;
+    return &scalar;
+}
+
 typedef struct gsf__amt_row_job { // of elementwise layers
+    const gsf__map_kernels* kernels;
     const gsf__map *x, *x2, *y;
-    const float* slope; // per channel, or one for all
-    float leak;
-    double scale;       // of a resize: pixels of x per pixel of y
+    const float* slope;            // per channel, or NULL
+    float leak;                    // one for all
+    double scale;                  // of a resize: pixels of x per pixel of y
     float by;
-    const double* moments;
+    double* moments;               // (rows, channels in whole vectors, 2)
+    const float *means, *factors;  // (images, 2, channels), (images, channels)
 } gsf__amt_row_job;
+
+static gsf__amt_row_job gsf__amt_begin(const gsf__amt* net, const gsf__map* x, const gsf__map* y) {
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__map_kernels_of(net->ctx->cpu_level);
+    job.x = x;
+    job.y = y;
+    return job;
+}
 
 static float* gsf__map_row(const gsf__map* map, size_t row) { return map->data + (int64_t)row * map->width * map->pitch; }
 
 static void gsf__amt_activate_row(void* arg, size_t row, int32_t worker) { // in place: x < 0 times its slope
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const int64_t c = job->y->channels, width = job->y->width;
     float* y = gsf__map_row(job->y, row);
     (void)worker;
-    for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++)
-            y[c] = y[c] < 0.0f ? y[c] * (job->slope ? job->slope[c] : job->leak) : y[c];
+    if (!job->slope && job->y->pitch == c) job->kernels->leak(NULL, job->leak, width * c, y);
+    else
+        for (int64_t x = 0; x < width; x++) job->kernels->leak(job->slope, job->leak, c, y + x * job->y->pitch);
 }
 
 // PReLU with a slope per channel; NULL: `leak` for all, which is 0 for ReLU.
 static gsf_result gsf__amt_activate(gsf__amt* net, const gsf_nn_tensor* slope, float leak, const gsf__map* y) {
     float slopes[1024];
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
+    gsf__amt_row_job job = gsf__amt_begin(net, NULL, y);
     if (slope && slope->count > 1024)
         return gsf_fail(net->ctx, GSF_ERROR_UNSUPPORTED, "%s: more than 1024 channels", slope->name);
     if (slope) gsf_nn_convert_tensor(slope, 0, slope->count, slopes);
-    job.y = y;
     job.slope = slope ? slopes : NULL;
     job.leak = leak;
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_activate_row, &job);
@@ -16629,27 +16746,22 @@ static void gsf__amt_copy_row(void* arg, size_t row, int32_t worker) {
 }
 
 static void gsf__amt_copy(gsf__amt* net, const gsf__map* x, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_copy_row, &job);
 }
 
 static void gsf__amt_add_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const int64_t c = job->y->channels, dense = job->x->pitch == c && job->y->pitch == c;
     const float* x = gsf__map_row(job->x, row);
     float* y = gsf__map_row(job->y, row);
     (void)worker;
-    for (int64_t i = 0; i < job->y->width; i++, x += job->x->pitch, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++) y[c] += x[c];
+    for (int64_t i = 0; i < (dense ? 1 : job->y->width); i++, x += job->x->pitch, y += job->y->pitch)
+        job->kernels->add(x, dense ? job->y->width * c : c, y);
 }
 
 static void gsf__amt_add(gsf__amt* net, const gsf__map* x, const gsf__map* y) { // y += x
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_add_row, &job);
 }
 
@@ -16667,15 +16779,12 @@ static gsf__between gsf__look_between(double x, int64_t size) { // clamped to th
 }
 
 // y = by * bilinear interpolation of x (height and width of row 0) at a point; `channels` values
-static void gsf__map_sample(const gsf__map* x, gsf__between v, gsf__between u, float by, int64_t channels, float* y) {
-    const float *a = x->data + (v.low * x->width + u.low) * x->pitch,
-                *b = x->data + (v.low * x->width + u.high) * x->pitch;
-    const float *c = x->data + (v.high * x->width + u.low) * x->pitch,
-                *d = x->data + (v.high * x->width + u.high) * x->pitch;
-    for (int64_t i = 0; i < channels; i++) {
-        const float top = a[i] + (b[i] - a[i]) * u.share, bottom = c[i] + (d[i] - c[i]) * u.share;
-        y[i] = by * (top + (bottom - top) * v.share);
-    }
+static void gsf__map_sample(const gsf__map_kernels* kernels, const gsf__map* x, gsf__between v, gsf__between u, float by,
+                            int64_t channels, float* y) {
+    const float *top = x->data + v.low * x->width * x->pitch, *bottom = x->data + v.high * x->width * x->pitch;
+    const float* const corners[4] = {top + u.low * x->pitch, top + u.high * x->pitch, bottom + u.low * x->pitch,
+                                     bottom + u.high * x->pitch};
+    kernels->mix(corners, u.share, v.share, by, channels, y);
 }
 
 static void gsf__amt_resize_row(void* arg, size_t row, int32_t worker) {
@@ -16684,16 +16793,13 @@ static void gsf__amt_resize_row(void* arg, size_t row, int32_t worker) {
     const gsf__between v = gsf__look_between(((double)row + 0.5) * job->scale - 0.5, job->x->height);
     (void)worker;
     for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch)
-        gsf__map_sample(job->x, v, gsf__look_between(((double)i + 0.5) * job->scale - 0.5, job->x->width), job->by,
-                        job->y->channels, y);
+        gsf__map_sample(job->kernels, job->x, v, gsf__look_between(((double)i + 0.5) * job->scale - 0.5, job->x->width),
+                        job->by, job->y->channels, y);
 }
 
 // y = by * x resized bilinearly, without antialiasing, as PyTorch does it (align_corners=False); one image
 static void gsf__amt_resize(gsf__amt* net, const gsf__map* x, double scale, double by, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     job.scale = 1.0 / scale;
     job.by = (float)by;
     gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_resize_row, &job);
@@ -16705,57 +16811,62 @@ static void gsf__amt_warp_row(void* arg, size_t row, int32_t worker) { // x2: th
     float* y = gsf__map_row(job->y, row);
     (void)worker;
     for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch, flow += job->x2->pitch)
-        gsf__map_sample(job->x, gsf__look_between((double)row + (double)flow[1], job->x->height),
+        gsf__map_sample(job->kernels, job->x, gsf__look_between((double)row + (double)flow[1], job->x->height),
                         gsf__look_between((double)i + (double)flow[0], job->x->width), 1.0f, job->y->channels, y);
 }
 
 static void gsf__amt_warp(gsf__amt* net, const gsf__map* x, const gsf__map* flow, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     job.x2 = flow;
-    job.y = y;
     gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_warp_row, &job);
 }
 
-static void gsf__amt_sum_channel(void* arg, size_t chunk, int32_t worker) { // mean and deviation of a channel of an image
+static void gsf__amt_moments_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
     const gsf__map* y = job->y;
-    const int64_t image = (int64_t)chunk / y->channels, pixels = y->height * y->width;
-    const float* from = y->data + image * pixels * y->pitch + (int64_t)chunk % y->channels;
-    double sum = 0.0, square = 0.0, *out = (double*)(uintptr_t)job->moments + 2 * chunk;
     (void)worker;
-    for (int64_t i = 0; i < pixels; i++) sum += (double)from[i * y->pitch];
-    const double mean = sum / (double)pixels;
-    for (int64_t i = 0; i < pixels; i++) square += ((double)from[i * y->pitch] - mean) * ((double)from[i * y->pitch] - mean);
-    out[0] = mean;
-    out[1] = 1.0 / sqrt(square / (double)pixels + 1e-5);
+    job->kernels->moments(gsf__map_row(y, row), y->width, y->channels, y->pitch,
+                          job->moments + (int64_t)row * 2 * gsf__round_up(y->channels, GSF__CONV_N));
 }
 
 static void gsf__amt_norm_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
-    const double* moments = job->moments + (int64_t)row / job->y->height * 2 * job->y->channels;
+    const int64_t image = (int64_t)row / job->y->height, c = job->y->channels;
     float* y = gsf__map_row(job->y, row);
     (void)worker;
     for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++) {
-            const float v = (float)(((double)y[c] - moments[2 * c]) * moments[2 * c + 1]);
-            y[c] = v < 0.0f ? v * job->leak : v;
-        }
+        job->kernels->scale(job->means + image * 2 * c, job->factors + image * c, job->leak, c, y);
+}
+
+// Mean and 1 / deviation of channel c of an image, from the sums of its rows.
+static void gsf__amt_norm_of(const gsf__map* y, const double* moments, int64_t c, float* means, float* factor) {
+    const double pixels = (double)y->height * (double)y->width;
+    double sum = 0.0, square = 0.0;
+    for (int64_t row = 0; row < y->height; row++, moments += 2 * gsf__round_up(y->channels, GSF__CONV_N)) {
+        sum += moments[2 * c];
+        square += moments[2 * c + 1];
+    }
+    const double mean = sum / pixels, variance = square / pixels - mean * mean;
+    means[c] = (float)mean;
+    means[y->channels + c] = (float)(mean - (double)means[c]);
+    *factor = (float)(1.0 / sqrt((variance < 0.0 ? 0.0 : variance) + 1e-5));
 }
 
 // Instance norm in place: each channel of each image gets mean 0 and deviation 1; then ReLU, if `rectify` is set.
 static gsf_result gsf__amt_norm(gsf__amt* net, int rectify, const gsf__map* y) {
-    const size_t count = (size_t)(y->images * y->channels);
-    double* moments = (double*)gsf_alloc(net->ctx, count, 2 * sizeof(double));
-    gsf__amt_row_job job;
+    const int64_t rows = y->images * y->height, c = y->channels, sums = 2 * gsf__round_up(c, GSF__CONV_N);
+    double* moments = (double*)gsf_alloc(net->ctx, (size_t)(rows * sums + 2 * y->images * c), sizeof(double));
+    gsf__amt_row_job job = gsf__amt_begin(net, NULL, y);
     if (!moments) return GSF_ERROR_OUT_OF_MEMORY;
-    memset(&job, 0, sizeof job);
-    job.y = y;
+    float *means = (float*)(void*)(moments + rows * sums), *factors = means + 2 * y->images * c;
     job.moments = moments;
+    job.means = means;
+    job.factors = factors;
     job.leak = rectify ? 0.0f : 1.0f;
-    gsf__parallel_for(net->ctx, count, gsf__amt_sum_channel, &job);
-    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_norm_row, &job);
+    gsf__parallel_for(net->ctx, (size_t)rows, gsf__amt_moments_row, &job);
+    for (int64_t i = 0; i < y->images * c; i++)
+        gsf__amt_norm_of(y, moments + i / c * y->height * sums, i % c, means + i / c * 2 * c, factors + i);
+    gsf__parallel_for(net->ctx, (size_t)rows, gsf__amt_norm_row, &job);
     gsf_free(net->ctx, moments);
     return gsf__check_cancel(net->ctx);
 }
@@ -16858,19 +16969,11 @@ static gsf_result gsf__amt_decode(gsf__amt* net, const gsf__amt_decoder* d, cons
 // ---- AMT-S: correlation
 
 typedef struct gsf__amt_lookup_job {
+    const gsf__map_kernels* kernels;
     const gsf__map* from;                    // features of one image, 1/8
     const gsf__map* pyramid;                 // (levels) of the other's
     const gsf__map *flow, *out;              // (flow: 2 channels, in 1/8 pixels; out: levels * 49)
 } gsf__amt_lookup_job;
-
-static float gsf__amt_dot(const float* a, const float* b, int64_t count) {
-    float sums[8] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8)
-        for (int k = 0; k < 8; k++) sums[k] += a[i + k] * b[i + k];
-    for (; i < count; i++) sums[i & 7] += a[i] * b[i];
-    return ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
-}
 
 static void gsf__amt_lookup_row(void* arg, size_t row, int32_t worker) {
     enum { SIDE = GSF__AMT_WINDOW + 1 };
@@ -16890,12 +16993,12 @@ static void gsf__amt_lookup_row(void* arg, size_t row, int32_t worker) {
             if (!(fabs(v) < 1e6)) v = 1e6;
             const int64_t u0 = (int64_t)floor(u) - GSF__AMT_RADIUS, v0 = (int64_t)floor(v) - GSF__AMT_RADIUS;
             const float du = (float)(u - floor(u)), dv = (float)(v - floor(v));
-            for (int64_t j = 0; j < SIDE; j++)
-                for (int64_t i = 0; i < SIDE; i++) {
-                    const int inside = u0 + i >= 0 && u0 + i < to->width && v0 + j >= 0 && v0 + j < to->height;
-                    const float* at = inside ? to->data + ((v0 + j) * to->width + u0 + i) * to->pitch : NULL;
-                    products[j][i] = at ? scale * gsf__amt_dot(from, at, channels) : 0.0f;
-                }
+            const int64_t first = u0 < 0 ? -u0 : 0, last = gsf__least(SIDE, to->width - u0); // those inside
+            memset(products, 0, sizeof products);
+            for (int64_t j = 0; j < SIDE && first < last; j++)
+                if (v0 + j >= 0 && v0 + j < to->height)
+                    job->kernels->products(from, to->data + ((v0 + j) * to->width + u0 + first) * to->pitch, last - first,
+                                           to->pitch, channels, scale, products[j] + first);
             float* window = out + level * GSF__AMT_WINDOW * GSF__AMT_WINDOW;
             for (int64_t i = 0; i < GSF__AMT_WINDOW; i++) // the offset in x varies slowest
                 for (int64_t j = 0; j < GSF__AMT_WINDOW; j++) {
@@ -16919,10 +17022,7 @@ static void gsf__amt_pool_row(void* arg, size_t row, int32_t worker) { // means 
 static gsf_result gsf__amt_make_pyramid(gsf__amt* net, const gsf__map* features, gsf__map* pyramid) {
     pyramid[0] = *features;
     for (int i = 1; i < GSF__AMT_LEVELS; i++) {
-        gsf__amt_row_job job;
-        memset(&job, 0, sizeof job);
-        job.x = &pyramid[i - 1];
-        job.y = &pyramid[i];
+        gsf__amt_row_job job = gsf__amt_begin(net, &pyramid[i - 1], &pyramid[i]);
         GSF__TRY(gsf__amt_make(net, 1, job.x->height / 2, job.x->width / 2, job.x->channels, &pyramid[i]));
         gsf__parallel_for(net->ctx, (size_t)pyramid[i].height, gsf__amt_pool_row, &job);
     }
@@ -16986,7 +17086,8 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
     for (int i = 0; i < 2; i++) { // the middle's flow to the second image, doubled, leads from the first to it
         const gsf__map way = gsf__map_slice(&flow, 2 * !i, 2);
         const gsf__map out = gsf__map_slice(&corr, i * GSF__AMT_LOOKUP, GSF__AMT_LOOKUP);
-        gsf__amt_lookup_job job = {&pair->pyramids[i][0], pair->pyramids[!i], &way, &out};
+        gsf__amt_lookup_job job = {gsf__map_kernels_of(net->ctx->cpu_level), &pair->pyramids[i][0], pair->pyramids[!i], &way,
+                                   &out};
         gsf__parallel_for(net->ctx, (size_t)high, gsf__amt_lookup_row, &job);
     }
     gsf__amt_reveal(net, "update.in_flow", scale, &flow);
@@ -17065,6 +17166,7 @@ static gsf_result gsf__amt_refine(gsf__amt* net, int scale, const gsf__amt_pair*
 }
 
 typedef struct gsf__amt_merge_job {
+    const gsf__map_kernels* kernels;
     const gsf__map *images, *decoded, *candidates;
     double mean;
 } gsf__amt_merge_job;
@@ -17082,7 +17184,7 @@ static void gsf__amt_merge_row(void* arg, size_t row, int32_t worker) {
             const double mask = 1.0 / (1.0 + exp(-(double)d[4 * GSF__AMT_FLOWS + k]));
             for (int i = 0; i < 2; i++) {
                 const float* flow = d + 2 * (i * GSF__AMT_FLOWS + k);
-                gsf__map_sample(&image[i], gsf__look_between((double)row + (double)flow[1], image[i].height),
+                gsf__map_sample(job->kernels, &image[i], gsf__look_between((double)row + (double)flow[1], image[i].height),
                                 gsf__look_between((double)x + (double)flow[0], image[i].width), 1.0f, 3, warped[i]);
             }
             for (int c = 0; c < 3; c++)
@@ -17100,7 +17202,7 @@ static gsf_result gsf__amt_interpolate(gsf__amt* net, gsf__amt_pair* pair, gsf__
         if (scale > 0) GSF__TRY(gsf__amt_update_run(net, scale, pair, &finer));
     }
     GSF__TRY(gsf__amt_make(net, 1, pair->images.height, pair->images.width, 3 * GSF__AMT_FLOWS, &candidates));
-    gsf__amt_merge_job job = {&pair->images, &decoded, &candidates, pair->mean};
+    gsf__amt_merge_job job = {gsf__map_kernels_of(net->ctx->cpu_level), &pair->images, &decoded, &candidates, pair->mean};
     gsf__parallel_for(net->ctx, (size_t)candidates.height, gsf__amt_merge_row, &job);
     GSF__TRY(gsf__amt_convolve(net, &net->merge[0], 1, &candidates, &hidden));
     GSF__TRY(gsf__amt_convolve(net, &net->merge[1], 1, &hidden, out));
