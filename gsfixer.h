@@ -5054,8 +5054,9 @@ GSF__V_KERNEL void GSF__V(gsf__ssim_value)(const gsf__ssim_form* form, const dou
     const double *b = map + pitch, *aa = b + pitch, *bb = aa + pitch, *ab = form->together ? bb : bb + pitch;
     for (size_t i = 0; n >= lanes; i = i + 2 * lanes <= n ? i + lanes : n - lanes) {
         const gsf__vd both = form->together ? gsf__vd_set(0.0) : gsf__vd_read(bb + i);
-        gsf__vd_write(out + i, GSF__V(gsf__ssim_one)(form, gsf__vd_read(map + i), gsf__vd_read(b + i), gsf__vd_read(aa + i), both,
-                                                     gsf__vd_read(ab + i)));
+        const gsf__vd mab = gsf__vd_read(ab + i);
+        gsf__vd_write(out + i, GSF__V(gsf__ssim_one)(form, gsf__vd_read(map + i), gsf__vd_read(b + i), gsf__vd_read(aa + i),
+                                                     both, mab));
         if (i + lanes == n) return;
     }
     for (size_t i = 0; i < n; i++)

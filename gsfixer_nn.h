@@ -15600,13 +15600,15 @@ GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b,
 GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
     for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
         const size_t left = (size_t)(c - i);
-#define GSF_X(j)                                                                                                         \
-        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left), b##j = gsf__v_load_first(rows[1] + j * c + i, left); \
-        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left), e##j = gsf__v_load_first(rows[3] + j * c + i, left); \
+#define GSF_X(j)                                                                                          \
+        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left);                                \
+        const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, left);                                \
+        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left);                                \
+        const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, left);                                \
         const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
         GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
 #undef GSF_X
-#define GSF_X(k)                                                    \
+#define GSF_X(k)                                                             \
         gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
         gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
         gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
@@ -15622,9 +15624,9 @@ GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, co
     for (int64_t i = 0; i < n; i += GSF__LANES, m += GSF__LANES) {
         const size_t left = (size_t)(n - i);
         const gsf__vf b = gsf__v_load_first(bias + i, left);
-#define GSF_X(k)                                                                                                 \
-        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);                  \
-        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next);           \
+#define GSF_X(k)                                                                                       \
+        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);        \
+        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next); \
         const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
         GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
 #undef GSF_X
@@ -15764,7 +15766,8 @@ static void gsf__winograd_pack_block(void* arg, size_t block, int32_t worker) { 
             if (n < n_end) gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c) * 9, 9, values);
             for (int i = 0; i < 4; i++)
                 for (int x = 0; x < 3; x++)
-                    rows[i][x] = g[i][0] * (double)values[x] + g[i][1] * (double)values[3 + x] + g[i][2] * (double)values[6 + x];
+                    rows[i][x] = g[i][0] * (double)values[x] + g[i][1] * (double)values[3 + x] +
+                                 g[i][2] * (double)values[6 + x];
             for (int p = 0; p < GSF__WINOGRAD_POINTS; p++)
                 to[p * blocks * panel + c * GSF__CONV_N + n] =
                     (float)(rows[p / 4][0] * g[p % 4][0] + rows[p / 4][1] * g[p % 4][1] + rows[p / 4][2] * g[p % 4][2]);
