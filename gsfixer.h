@@ -4266,16 +4266,20 @@ static void gsf__halve_rows(void* arg, size_t chunk, int32_t worker) { // means 
     const gsf__rows rows = gsf__chunk_rows(dst, chunk);
     const int64_t channels = dst->channels;
     (void)worker;
-    for (int64_t y = rows.begin; y < rows.end; y++)
-        for (int64_t x = 0; x < dst->width; x++)
-            for (int64_t c = 0; c < channels; c++) {
-                double sum = 0.0;
-                for (int k = 0; k < 4; k++) {
-                    const int64_t v = 2 * y + k / 2 - job->top, u = 2 * x + k % 2 - job->left;
-                    if (v >= 0 && u >= 0) sum += (double)((const float*)src->data)[(v * src->width + u) * channels + c];
-                }
-                ((float*)dst->data)[(y * dst->width + x) * channels + c] = (float)(sum / 4.0);
+    for (int64_t y = rows.begin; y < rows.end; y++) {
+        const int64_t v = 2 * y - job->top, pitch = src->width * channels;
+        const float* from = (const float*)src->data;
+        float* to = (float*)dst->data + y * dst->width * channels;
+        int64_t at = v * pitch - job->left * channels; // of the first of four pixels
+        for (int64_t x = 0; x < dst->width; x++, at += channels)
+            for (int64_t c = 0; c < channels; c++, at++, to++) {
+                const int above = v >= 0, left = x > 0 || !job->left; // are there
+                double sum = above && left ? (double)from[at] : 0.0;
+                if (above) sum += (double)from[at + channels];
+                if (left) sum += (double)from[at + pitch];
+                *to = (float)((sum + (double)from[at + pitch + channels]) / 4.0);
             }
+    }
 }
 
 // Replaces a packed f32 image by one of half its size.
