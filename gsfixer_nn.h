@@ -15451,9 +15451,6 @@ GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* de
 
 // ---- metrics: kernels of feature maps
 
-// The products of Winograd's convolution (below), and outputs of a packed panel.
-enum { GSF__WINOGRAD_POINTS = 16 };
-
 #define GSF__KERNELS "gsfixer_nn.h"
 #define GSF__KERNELS_MAPS
 #define GSF__KERNELS_AVX512
@@ -15596,7 +15593,7 @@ GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b,
     return sum;
 }
 
-// The 16 products' factors from 4 x 4 pixels, which begin at rows[0..3] and are `c` channels apart: v (16, next).
+// For Winograd's convolution (below): the factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next).
 GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
     for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
         const size_t left = (size_t)(c - i);
@@ -15742,8 +15739,9 @@ typedef struct gsf__map_conv { // a convolution; kernel and channels are those o
    their tiles: weights, (16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so that rounding
    errors stay those of a sum of products. */
 
-enum { GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // of a segment; a multiple of the pixels per product
-       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that a segment may hold beyond the least number of tiles
+enum { GSF__WINOGRAD_POINTS = 16,
+       GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // tiles of a segment: least, most; multiples of M and M10
+       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that more than the least number of tiles may take
 
 static int64_t gsf__winograd_packed(const gsf__conv_layer* layer) { // floats: biases, weights
     return gsf__conv_blocks(layer) * GSF__CONV_N * (1 + GSF__WINOGRAD_POINTS * layer->in);
