@@ -3955,6 +3955,19 @@ GSF_API gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_
 
 // ---- >>metrics -----------------------------------------------------------------
 
+typedef struct gsf__ssim_form { // of a value of SSIM
+    int clamp;     // variances below 0 to 0
+    int contrast;  // only the factor of contrast and structure
+    int together;  // the variances of both images come as one
+    double factor; // of variances and covariances
+} gsf__ssim_form;
+
+#define GSF__KERNELS "gsfixer.h" // they are at the end of this file
+#define GSF__KERNELS_METRICS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_METRICS
+
 static gsf_result gsf__check_image_pair(gsf_context* ctx, const char* what, const gsf_image* a, const gsf_image* b,
                                         const gsf_image* mask) {
     GSF__TRY(gsf__check_image(ctx, what, a));
@@ -3998,6 +4011,7 @@ static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf
 typedef struct gsf__pixel_job {
     const gsf_image *a, *b, *mask;
     int absolute;          // sums absolute differences instead of squares
+    double (*bytes)(const uint8_t* a, const uint8_t* b, int64_t n, int absolute);
     gsf__metric_sum* sums; // one per chunk
 } gsf__pixel_job;
 
@@ -4010,17 +4024,13 @@ static void gsf__pixel_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__pixel_job* job = (const gsf__pixel_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
     const gsf__rows rows = gsf__chunk_rows(a, chunk);
-    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) { // in integers
+    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) {
         const int64_t n = a->width * a->channels;
-        uint64_t all = 0;
-        for (int64_t y = rows.begin; y < rows.end; y++) {
-            const uint8_t *u = (const uint8_t*)a->data + y * a->stride_y, *v = (const uint8_t*)b->data + y * b->stride_y;
-            for (int64_t i = 0; i < n; i++) {
-                const int d = u[i] - v[i];
-                all += (uint64_t)(job->absolute ? (d < 0 ? -d : d) : d * d);
-            }
-        }
-        job->sums[chunk].sum = (double)all / (job->absolute ? 255.0 : 255.0 * 255.0);
+        double all = 0.0;
+        for (int64_t y = rows.begin; y < rows.end; y++)
+            all += job->bytes((const uint8_t*)a->data + y * a->stride_y, (const uint8_t*)b->data + y * b->stride_y, n,
+                              job->absolute);
+        job->sums[chunk].sum = all / (job->absolute ? 255.0 : 255.0 * 255.0);
         job->sums[chunk].count = (uint64_t)(n * (rows.end - rows.begin));
         return;
     }
@@ -4053,6 +4063,7 @@ static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolu
     job.b = b;
     job.mask = mask;
     job.absolute = absolute;
+    job.bytes = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__difference_of_bytes);
     const size_t chunks = gsf__row_chunks(a);
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
@@ -4080,19 +4091,6 @@ GSF_API gsf_result gsf_measure_difference(gsf_context* ctx, const gsf_image* a, 
    along y gives a row of the SSIM map. Each chunk of rows fills its own ring, so that chunks are independent. */
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
-
-typedef struct gsf__ssim_form { // of a value
-    int clamp;     // variances below 0 to 0
-    int contrast;  // only the factor of contrast and structure
-    int together;  // the variances of both images come as one
-    double factor; // of variances and covariances
-} gsf__ssim_form;
-
-#define GSF__KERNELS "gsfixer.h" // they are at the end of this file
-#define GSF__KERNELS_SSIM
-#define GSF__KERNELS_AVX512
-#include "gsfixer.h"
-#undef GSF__KERNELS_SSIM
 
 typedef struct gsf__ssim_job {
     const gsf_image *a, *b, *mask;
@@ -4990,10 +4988,28 @@ GSF__END_IMPLEMENTATION
 
 #ifdef GSF_INTERNALS_INCLUDED
 
-#if defined(GSF__KERNELS_SSIM) && defined(GSF__ISA)
+#if defined(GSF__KERNELS_METRICS) && defined(GSF__ISA)
 
-// Rows end with a vector that may overlap the one before it; shorter ones go value by value. The operations and their order are
-// the same at every instruction set, and none is fused, so that results are the same, too.
+// The sum of absolute differences of bytes, or of their squares. It is exact, as 256 squares fit into a float.
+GSF__V_KERNEL double GSF__V(gsf__difference_of_bytes)(const uint8_t* a, const uint8_t* b, int64_t n, int absolute) {
+    gsf__vd sums[GSF__HALVES];
+    double sum = 0.0;
+    for (int h = 0; h < GSF__HALVES; h++) sums[h] = gsf__vd_set(0.0);
+    for (int64_t i = 0, end; i < n;) {
+        gsf__vf part = gsf__v_set(0.0f);
+        for (end = i + 256 * GSF__LANES < n ? i + 256 * GSF__LANES : n; i < end; i += GSF__LANES) {
+            const gsf__vf d = gsf__v_load_bytes(a + i, (size_t)(n - i)) - gsf__v_load_bytes(b + i, (size_t)(n - i));
+            if (absolute) part = part + gsf__v_abs(d);
+            else part = part + d * d;
+        }
+        for (int h = 0; h < GSF__HALVES; h++) sums[h] = sums[h] + gsf__vd_half(part, h);
+    }
+    for (int h = 0; h < GSF__HALVES; h++) sum += gsf__vd_sum(sums[h]);
+    return sum;
+}
+
+// SSIM. Rows end with a vector that may overlap the one before it; shorter ones go value by value. The operations and their
+// order are the same at every instruction set, and none is fused, so that results are the same, too.
 
 // aa, bb: the squares, in aa both if bb is NULL; ab: the products
 GSF__V_KERNEL void GSF__V(gsf__ssim_square)(const double* a, const double* b, size_t n, double* aa, double* bb, double* ab) {
@@ -5067,7 +5083,7 @@ GSF__V_KERNEL void GSF__V(gsf__ssim_value)(const gsf__ssim_form* form, const dou
         out[i] = gsf__ssim_one_scalar(form, map[i], b[i], aa[i], form->together ? 0.0 : bb[i], ab[i]);
 }
 
-#endif // GSF__KERNELS_SSIM
+#endif // GSF__KERNELS_METRICS
 
 #ifdef GSF__KERNELS_POWERS
 #if GSF__LANES > 1
