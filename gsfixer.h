@@ -3056,13 +3056,18 @@ static void gsf__convert_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf_image *src = job->src, *dst = job->dst;
     const int in_float = src->dtype == GSF_F16 || src->dtype == GSF_F32;
     const gsf__rows rows = gsf__chunk_rows(dst, chunk);
+    const int by_table = src->dtype == GSF_U8 && dst->dtype == GSF_F32;
+    float values[256]; // of bytes: a division for each pixel would take most of the time
     double run[GSF__CONVERT_RUN];
+    for (int i = 0; by_table && i < 256; i++) values[i] = (float)(i / 255.0);
     for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < dst->channels; c++) {
             const char* from =
                 (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
             char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
-            for (int64_t x = 0; x < dst->width; x += GSF__CONVERT_RUN) {
+            for (int64_t x = 0; by_table && x < dst->width; x++, from += src->stride_x, to += dst->stride_x)
+                memcpy(to, &values[*(const unsigned char*)from], sizeof(float));
+            for (int64_t x = 0; !by_table && x < dst->width; x += GSF__CONVERT_RUN) {
                 const int64_t left = dst->width - x;
                 const size_t n = left < GSF__CONVERT_RUN ? (size_t)left : (size_t)GSF__CONVERT_RUN;
                 gsf__load_pixels(from + x * src->stride_x, src->stride_x, src->dtype, n, run);
