@@ -1311,6 +1311,8 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 
 #define gsf__vd_set GSF__V(gsf__vd_set)
 #define gsf__vd_load GSF__V(gsf__vd_load)           // from floats
+#define gsf__vd_read GSF__V(gsf__vd_read)           // from doubles
+#define gsf__vd_write GSF__V(gsf__vd_write)         // to doubles
 #define gsf__vd_half GSF__V(gsf__vd_half)           // half h < GSF__HALVES of the floats v, converted
 #define gsf__vd_floats GSF__V(gsf__vd_floats)       // GSF__HALVES halves, rounded to one gsf__vf
 #define gsf__vd_madd GSF__V(gsf__vd_madd)
@@ -1408,6 +1410,8 @@ GSF__SHARED inline int gsf__vm_not_scalar(int mask) { return !mask; }
 
 GSF__SHARED inline double gsf__vd_set_scalar(double x) { return x; }
 GSF__SHARED inline double gsf__vd_load_scalar(const float* p) { return (double)*p; }
+GSF__SHARED inline double gsf__vd_read_scalar(const double* p) { return *p; }
+GSF__SHARED inline void gsf__vd_write_scalar(double* p, double x) { *p = x; }
 GSF__SHARED inline double gsf__vd_half_scalar(float v, int h) { return h ? 0.0 : (double)v; }
 GSF__SHARED inline float gsf__vd_floats_scalar(const double* halves) { return (float)*halves; }
 GSF__SHARED inline double gsf__vd_madd_scalar(double a, double b, double c) { return a * b + c; }
@@ -1548,6 +1552,8 @@ GSF__INLINE_AVX2 __m256i gsf__v_truncate_avx2(__m256 x) { return _mm256_cvttps_e
 
 GSF__INLINE_AVX2 __m256d gsf__vd_set_avx2(double x) { return _mm256_set1_pd(x); }
 GSF__INLINE_AVX2 __m256d gsf__vd_load_avx2(const float* p) { return _mm256_cvtps_pd(_mm_loadu_ps(p)); }
+GSF__INLINE_AVX2 __m256d gsf__vd_read_avx2(const double* p) { return _mm256_loadu_pd(p); }
+GSF__INLINE_AVX2 void gsf__vd_write_avx2(double* p, __m256d x) { _mm256_storeu_pd(p, x); }
 GSF__INLINE_AVX2 __m256d gsf__vd_half_avx2(__m256 v, int h) {
     return _mm256_cvtps_pd(h ? _mm256_extractf128_ps(v, 1) : _mm256_castps256_ps128(v));
 }
@@ -1696,6 +1702,8 @@ GSF__INLINE_AVX512 __m512i gsf__v_truncate_avx512(__m512 x) { return _mm512_cvtt
 
 GSF__INLINE_AVX512 __m512d gsf__vd_set_avx512(double x) { return _mm512_set1_pd(x); }
 GSF__INLINE_AVX512 __m512d gsf__vd_load_avx512(const float* p) { return _mm512_cvtps_pd(_mm256_loadu_ps(p)); }
+GSF__INLINE_AVX512 __m512d gsf__vd_read_avx512(const double* p) { return _mm512_loadu_pd(p); }
+GSF__INLINE_AVX512 void gsf__vd_write_avx512(double* p, __m512d x) { _mm512_storeu_pd(p, x); }
 GSF__INLINE_AVX512 __m512d gsf__vd_half_avx512(__m512 v, int h) {
     return _mm512_cvtps_pd(h ? gsf__v_upper_avx512(v) : _mm512_castps512_ps256(v));
 }
@@ -3065,15 +3073,20 @@ static void gsf__convert_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf_image *src = job->src, *dst = job->dst;
     const int in_float = src->dtype == GSF_F16 || src->dtype == GSF_F32;
     const gsf__rows rows = gsf__chunk_rows(dst, chunk);
-    double run[GSF__CONVERT_RUN];
     const int transfer = src->color_space != dst->color_space;
+    const int by_table = src->dtype == GSF_U8 && dst->dtype == GSF_F32 && !transfer;
+    float values[256]; // of bytes: a division for each pixel would take most of the time
+    double run[GSF__CONVERT_RUN];
+    for (int i = 0; by_table && i < 256; i++) values[i] = (float)(i / 255.0);
     for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < dst->channels; c++) {
             const int alpha = dst->channels % 2 == 0 && c == dst->channels - 1;
             const char* from =
                 (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
             char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
-            for (int64_t x = 0; x < dst->width; x += GSF__CONVERT_RUN) {
+            for (int64_t x = 0; by_table && x < dst->width; x++, from += src->stride_x, to += dst->stride_x)
+                memcpy(to, &values[*(const unsigned char*)from], sizeof(float));
+            for (int64_t x = 0; !by_table && x < dst->width; x += GSF__CONVERT_RUN) {
                 const int64_t left = dst->width - x;
                 const size_t n = left < GSF__CONVERT_RUN ? (size_t)left : (size_t)GSF__CONVERT_RUN;
                 gsf__load_pixels(from + x * src->stride_x, src->stride_x, src->dtype, n, run);
@@ -3967,6 +3980,19 @@ GSF_API gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_
 
 // ---- >>metrics -----------------------------------------------------------------
 
+typedef struct gsf__ssim_form { // of a value of SSIM
+    int clamp;     // variances below 0 to 0
+    int contrast;  // only the factor of contrast and structure
+    int together;  // the variances of both images come as one
+    double factor; // of variances and covariances
+} gsf__ssim_form;
+
+#define GSF__KERNELS "gsfixer.h" // they are at the end of this file
+#define GSF__KERNELS_METRICS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_METRICS
+
 static gsf_result gsf__check_image_pair(gsf_context* ctx, const char* what, const gsf_image* a, const gsf_image* b,
                                         const gsf_image* mask) {
     GSF__TRY(gsf__check_image(ctx, what, a));
@@ -4010,6 +4036,7 @@ static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf
 typedef struct gsf__pixel_job {
     const gsf_image *a, *b, *mask;
     int absolute;          // sums absolute differences instead of squares
+    double (*bytes)(const uint8_t* a, const uint8_t* b, int64_t n, int absolute);
     gsf__metric_sum* sums; // one per chunk
 } gsf__pixel_job;
 
@@ -4022,17 +4049,13 @@ static void gsf__pixel_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__pixel_job* job = (const gsf__pixel_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
     const gsf__rows rows = gsf__chunk_rows(a, chunk);
-    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) { // in integers
+    if (!job->mask && gsf__is_packed_bytes(a) && gsf__is_packed_bytes(b)) {
         const int64_t n = a->width * a->channels;
-        uint64_t all = 0;
-        for (int64_t y = rows.begin; y < rows.end; y++) {
-            const uint8_t *u = (const uint8_t*)a->data + y * a->stride_y, *v = (const uint8_t*)b->data + y * b->stride_y;
-            for (int64_t i = 0; i < n; i++) {
-                const int d = u[i] - v[i];
-                all += (uint64_t)(job->absolute ? (d < 0 ? -d : d) : d * d);
-            }
-        }
-        job->sums[chunk].sum = (double)all / (job->absolute ? 255.0 : 255.0 * 255.0);
+        double all = 0.0;
+        for (int64_t y = rows.begin; y < rows.end; y++)
+            all += job->bytes((const uint8_t*)a->data + y * a->stride_y, (const uint8_t*)b->data + y * b->stride_y, n,
+                              job->absolute);
+        job->sums[chunk].sum = all / (job->absolute ? 255.0 : 255.0 * 255.0);
         job->sums[chunk].count = (uint64_t)(n * (rows.end - rows.begin));
         return;
     }
@@ -4064,6 +4087,7 @@ static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolu
     job.b = b;
     job.mask = mask;
     job.absolute = absolute;
+    job.bytes = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__difference_of_bytes);
     const size_t chunks = gsf__row_chunks(a);
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
@@ -4086,56 +4110,22 @@ static gsf_result gsf__psnr(gsf_context* ctx, const gsf_image* a, const gsf_imag
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
-// out[i] = sum over t of weights[t] * rows[t][i], where taps is odd and the weights are symmetric: pairs of rows are added
-// first, from the outermost one to the centre. The AVX2 version does the same operations in the same order, four i at a time.
-static void gsf__ssim_blur_scalar(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
-    const int last = taps - 1;
-    for (size_t i = 0; i < n; i++) {
-        double sum = weights[0] * (rows[0][i] + rows[last][i]);
-        for (int t = 1; t < taps / 2; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
-        out[i] = sum + weights[taps / 2] * rows[taps / 2][i];
-    }
-}
-
-#if GSF__X86
-GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights,
-                                                 int taps, size_t n) {
-    const int last = taps - 1, half = taps / 2;
-    const __m256d w0 = _mm256_set1_pd(weights[0]), centre = _mm256_set1_pd(weights[half]);
-    size_t i = 0;
-    for (; i + 8 <= n; i += 8) {
-        __m256d s0 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i), _mm256_loadu_pd(rows[last] + i)));
-        __m256d s1 = _mm256_mul_pd(w0, _mm256_add_pd(_mm256_loadu_pd(rows[0] + i + 4), _mm256_loadu_pd(rows[last] + i + 4)));
-        for (int t = 1; t < half; t++) {
-            const double *a = rows[t] + i, *b = rows[last - t] + i;
-            const __m256d w = _mm256_set1_pd(weights[t]);
-            s0 = _mm256_add_pd(s0, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a), _mm256_loadu_pd(b))));
-            s1 = _mm256_add_pd(s1, _mm256_mul_pd(w, _mm256_add_pd(_mm256_loadu_pd(a + 4), _mm256_loadu_pd(b + 4))));
-        }
-        _mm256_storeu_pd(out + i, _mm256_add_pd(s0, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i))));
-        _mm256_storeu_pd(out + i + 4, _mm256_add_pd(s1, _mm256_mul_pd(centre, _mm256_loadu_pd(rows[half] + i + 4))));
-    }
-    for (; i < n; i++) {
-        double sum = weights[0] * (rows[0][i] + rows[last][i]);
-        for (int t = 1; t < half; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
-        out[i] = sum + weights[half] * rows[half][i];
-    }
-}
-#endif
-
 typedef struct gsf__ssim_job {
     const gsf_image *a, *b, *mask;
     gsf_metric kind;
     int taps, radius;
     double weights[GSF__SSIM_MAX_TAPS];
     int64_t inset;           // map rows and columns left out at each border
-    int contrast;            // sum only SSIM's factor of contrast and structure
+    gsf__ssim_form form;
     size_t quantities;
+    double bytes[256];       // values of 8 bits
     size_t chunks_per_channel;
     gsf__metric_sum* sums;   // one per (channel, chunk)
     double* scratch;         // per worker: padded source rows, ring, quantities of a map row
     size_t scratch_size;     // doubles per worker
+    void (*square)(const double* a, const double* b, size_t n, double* aa, double* bb, double* ab);
     void (*blur)(double* out, const double* const* rows, const double* weights, int taps, size_t n);
+    void (*value)(const gsf__ssim_form* form, const double* map, size_t pitch, size_t n, double* out);
 } gsf__ssim_job;
 
 static int gsf__ssim_as_torchmetrics(gsf_metric kind) {
@@ -4143,6 +4133,16 @@ static int gsf__ssim_as_torchmetrics(gsf_metric kind) {
 }
 
 static int64_t gsf__reflect(int64_t i, int64_t n) { return i < 0 ? -i : i >= n ? 2 * n - 2 - i : i; }
+
+// Loads row y of a channel of an image.
+static void gsf__ssim_load_row(const gsf__ssim_job* job, const gsf_image* image, int32_t channel, int64_t y, double* out) {
+    const char* from = (const char*)image->data + y * image->stride_y + channel * image->stride_c;
+    if (image->dtype != GSF_U8) {
+        gsf__load_pixels(from, image->stride_x, image->dtype, (size_t)image->width, out);
+        return;
+    }
+    for (int64_t x = 0; x < image->width; x++) out[x] = job->bytes[*(const unsigned char*)(from + x * image->stride_x)];
+}
 
 // Blurs row y of both images along x, into five rows of `out` that are `pitch` doubles apart.
 // padded: scratch, 5 rows of width + 2 radius.
@@ -4159,10 +4159,8 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
         y = gsf__reflect(y, a->height);
     }
     double *pa = padded, *pb = padded + wide;
-    gsf__load_pixels((const char*)a->data + y * a->stride_y + channel * a->stride_c, a->stride_x, a->dtype, width,
-                     pa + radius);
-    gsf__load_pixels((const char*)b->data + y * b->stride_y + channel * b->stride_c, b->stride_x, b->dtype, width,
-                     pb + radius);
+    gsf__ssim_load_row(job, a, channel, y, pa + radius);
+    gsf__ssim_load_row(job, b, channel, y, pb + radius);
     for (int64_t x = -radius; x < 0; x++) { // pad both sides with zeros or the reflection
         const int64_t right = a->width - 1 - x; // as far outside the right border as x is outside the left
         const int mirror = gsf__ssim_as_torchmetrics(job->kind);
@@ -4172,13 +4170,8 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
             p[right] = mirror ? p[gsf__reflect(right, a->width)] : 0.0;
         }
     }
-    double *paa = pb + wide, *pbb = paa + wide, *pab = padded + (job->quantities - 1) * wide;
-    for (size_t i = 0; i < wide; i++) {
-        const double aa = pa[i] * pa[i], bb = pb[i] * pb[i];
-        paa[i] = job->quantities == 4 ? aa + bb : aa;
-        pbb[i] = bb; // where this is the place of pab, it is overwritten
-        pab[i] = pa[i] * pb[i];
-    }
+    double *paa = pb + wide, *pbb = job->form.together ? NULL : paa + wide;
+    job->square(pa, pb, wide, paa, pbb, padded + (job->quantities - 1) * wide);
     const double* rows[GSF__SSIM_MAX_TAPS];
     for (size_t q = 0; q < job->quantities; q++) {
         for (int t = 0; t < job->taps; t++) rows[t] = padded + q * wide + t;
@@ -4186,19 +4179,20 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
     }
 }
 
-static double gsf__ssim_value(gsf_metric kind, int contrast, double ma, double mb, double maa, double mbb, double mab) {
-    const double c1 = 0.01 * 0.01, c2 = 0.03 * 0.03;
-    double va = maa - ma * ma, vb = mbb - mb * mb, cov = mab - ma * mb;
-    if (gsf__ssim_as_torchmetrics(kind)) {
-        if (va < 0.0) va = 0.0;
-        if (vb < 0.0) vb = 0.0;
-    } else if (kind == GSF_METRIC_SSIM_SKIMAGE) { // unbiased covariance of 7 x 7 samples
-        va *= 49.0 / 48.0;
-        vb *= 49.0 / 48.0;
-        cov *= 49.0 / 48.0;
-    }
-    if (contrast) return (2.0 * cov + c2) / (va + vb + c2);
-    return ((2.0 * ma * mb + c1) * (2.0 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
+// The sum over a row's pixels that the mask includes, in four sums.
+static gsf__metric_sum gsf__ssim_sum_row(const gsf_image* mask, int64_t row, int64_t begin, int64_t end, const double* values) {
+    double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+    gsf__metric_sum all = {0.0, (uint64_t)(end - begin)};
+    int64_t x = begin;
+    for (; !mask && x + 4 <= end; x += 4) s0 += values[x], s1 += values[x + 1], s2 += values[x + 2], s3 += values[x + 3];
+    for (; x < end; x++)
+        if (!gsf__mask_at(mask, x, row)) all.count--;
+        else if ((x - begin) % 4 == 0) s0 += values[x];
+        else if ((x - begin) % 4 == 1) s1 += values[x];
+        else if ((x - begin) % 4 == 2) s2 += values[x];
+        else s3 += values[x];
+    all.sum = (s0 + s1) + (s2 + s3);
+    return all;
 }
 
 static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
@@ -4223,13 +4217,11 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
             for (size_t t = 0; t < taps; t++) rows[t] = ring + (q * taps + (slot + 1 + t) % taps) * width;
             job->blur(map + q * width, rows, job->weights, job->taps, width);
         }
-        const double *covariances = map + (job->quantities - 1) * width, *squares = map + 3 * width;
-        for (size_t x = (size_t)job->inset; x < width - (size_t)job->inset; x++)
-            if (gsf__mask_at(job->mask, (int64_t)x, row)) {
-                sum += gsf__ssim_value(job->kind, job->contrast, map[x], map[width + x], map[2 * width + x],
-                                       job->quantities == 4 ? 0.0 : squares[x], covariances[x]);
-                count++;
-            }
+        job->value(&job->form, map, width, width, padded); // the source row is not needed any more
+        const gsf__metric_sum of_row =
+            gsf__ssim_sum_row(job->mask, row, job->inset, (int64_t)width - job->inset, padded);
+        sum += of_row.sum;
+        count += of_row.count;
     }
     job->sums[chunk].sum = sum;
     job->sums[chunk].count = count;
@@ -4250,15 +4242,21 @@ static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_metric kind, int contrast,
     job->b = b;
     job->mask = mask;
     job->kind = kind;
-    job->contrast = contrast;
-    job->quantities = gsf__ssim_as_torchmetrics(kind) ? 5 : 4; // variances clamped one by one
+    job->form.clamp = gsf__ssim_as_torchmetrics(kind);
+    job->form.contrast = contrast;
+    job->form.together = !job->form.clamp; // variances that are clamped are needed one by one
+    job->form.factor = kind == GSF_METRIC_SSIM_SKIMAGE ? 49.0 / 48.0 : 1.0; // unbiased covariance of 7 x 7 samples
+    for (int i = 0; i < 256; i++) job->bytes[i] = i / 255.0;
+    job->quantities = job->form.together ? 4 : 5;
     job->taps = kind == GSF_METRIC_SSIM_SKIMAGE ? 7 : 11;
     job->radius = job->taps / 2;
     const double* half = gauss[kind != GSF_METRIC_SSIM_3DGS];
     for (int t = 0; t < job->taps; t++)
         job->weights[t] = kind == GSF_METRIC_SSIM_SKIMAGE ? 1.0 / 7.0 : half[t < 5 ? 5 - t : t - 5];
     if (kind == GSF_METRIC_SSIM_SKIMAGE || kind == GSF_METRIC_MS_SSIM || contrast) job->inset = job->radius;
-    job->blur = GSF__KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
+    job->square = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_square);
+    job->blur = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
+    job->value = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_value);
     job->chunks_per_channel = (size_t)((a->height - 2 * job->inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
     size_t chunks = 0;
     if (!gsf__mul_size(job->chunks_per_channel, (size_t)a->channels, &chunks) ||
@@ -4289,16 +4287,20 @@ static void gsf__halve_rows(void* arg, size_t chunk, int32_t worker) { // means 
     const gsf__rows rows = gsf__chunk_rows(dst, chunk);
     const int64_t channels = dst->channels;
     (void)worker;
-    for (int64_t y = rows.begin; y < rows.end; y++)
-        for (int64_t x = 0; x < dst->width; x++)
-            for (int64_t c = 0; c < channels; c++) {
-                double sum = 0.0;
-                for (int k = 0; k < 4; k++) {
-                    const int64_t v = 2 * y + k / 2 - job->top, u = 2 * x + k % 2 - job->left;
-                    if (v >= 0 && u >= 0) sum += (double)((const float*)src->data)[(v * src->width + u) * channels + c];
-                }
-                ((float*)dst->data)[(y * dst->width + x) * channels + c] = (float)(sum / 4.0);
+    for (int64_t y = rows.begin; y < rows.end; y++) {
+        const int64_t v = 2 * y - job->top, pitch = src->width * channels;
+        const float* from = (const float*)src->data;
+        float* to = (float*)dst->data + y * dst->width * channels;
+        int64_t at = v * pitch - job->left * channels; // of the first of four pixels
+        for (int64_t x = 0; x < dst->width; x++, at += channels)
+            for (int64_t c = 0; c < channels; c++, at++, to++) {
+                const int above = v >= 0, left = x > 0 || !job->left; // are there
+                double sum = above && left ? (double)from[at] : 0.0;
+                if (above) sum += (double)from[at + channels];
+                if (left) sum += (double)from[at + pitch];
+                *to = (float)((sum + (double)from[at + pitch + channels]) / 4.0);
             }
+    }
 }
 
 // Replaces a packed f32 image by one of half its size.
@@ -5023,6 +5025,103 @@ GSF__END_IMPLEMENTATION
 
 #ifdef GSF_INTERNALS_INCLUDED
 
+#if defined(GSF__KERNELS_METRICS) && defined(GSF__ISA)
+
+// The sum of absolute differences of bytes, or of their squares. It is exact, as 256 squares fit into a float.
+GSF__V_KERNEL double GSF__V(gsf__difference_of_bytes)(const uint8_t* a, const uint8_t* b, int64_t n, int absolute) {
+    gsf__vd sums[GSF__HALVES];
+    double sum = 0.0;
+    for (int h = 0; h < GSF__HALVES; h++) sums[h] = gsf__vd_set(0.0);
+    for (int64_t i = 0, end; i < n;) {
+        gsf__vf part = gsf__v_set(0.0f);
+        for (end = i + 256 * GSF__LANES < n ? i + 256 * GSF__LANES : n; i < end; i += GSF__LANES) {
+            const gsf__vf d = gsf__v_load_bytes(a + i, (size_t)(n - i)) - gsf__v_load_bytes(b + i, (size_t)(n - i));
+            if (absolute) part = part + gsf__v_abs(d);
+            else part = part + d * d;
+        }
+        for (int h = 0; h < GSF__HALVES; h++) sums[h] = sums[h] + gsf__vd_half(part, h);
+    }
+    for (int h = 0; h < GSF__HALVES; h++) sum += gsf__vd_sum(sums[h]);
+    return sum;
+}
+
+// SSIM. Rows end with a vector that may overlap the one before it; shorter ones go value by value. The operations and their
+// order are the same at every instruction set, and none is fused, so that results are the same, too.
+
+// aa, bb: the squares, in aa both if bb is NULL; ab: the products
+GSF__V_KERNEL void GSF__V(gsf__ssim_square)(const double* a, const double* b, size_t n, double* aa, double* bb, double* ab) {
+    const size_t lanes = GSF__LANES / GSF__HALVES;
+    size_t i = 0;
+    for (; i + lanes <= n; i += lanes) {
+        const gsf__vd x = gsf__vd_read(a + i), y = gsf__vd_read(b + i);
+        gsf__vd_write(aa + i, bb ? x * x : x * x + y * y);
+        if (bb) gsf__vd_write(bb + i, y * y);
+        gsf__vd_write(ab + i, x * y);
+    }
+    for (; i < n; i++) {
+        aa[i] = bb ? a[i] * a[i] : a[i] * a[i] + b[i] * b[i];
+        if (bb) bb[i] = b[i] * b[i];
+        ab[i] = a[i] * b[i];
+    }
+}
+
+// out[i] = sum over t of weights[t] * rows[t][i], where taps is odd and the weights are symmetric: pairs of rows are added
+// first, from the outermost one to the centre.
+GSF__V_KERNEL void GSF__V(gsf__ssim_blur)(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
+    const size_t lanes = GSF__LANES / GSF__HALVES, step = 2 * lanes;
+    const int last = taps - 1, half = taps / 2;
+    const gsf__vd w0 = gsf__vd_set(weights[0]), centre = gsf__vd_set(weights[half]);
+    for (size_t i = 0; n >= step; i = i + 2 * step <= n ? i + step : n - step) {
+        gsf__vd s0 = w0 * (gsf__vd_read(rows[0] + i) + gsf__vd_read(rows[last] + i));
+        gsf__vd s1 = w0 * (gsf__vd_read(rows[0] + i + lanes) + gsf__vd_read(rows[last] + i + lanes));
+        for (int t = 1; t < half; t++) {
+            const double *a = rows[t] + i, *b = rows[last - t] + i;
+            const gsf__vd w = gsf__vd_set(weights[t]);
+            s0 = s0 + w * (gsf__vd_read(a) + gsf__vd_read(b));
+            s1 = s1 + w * (gsf__vd_read(a + lanes) + gsf__vd_read(b + lanes));
+        }
+        gsf__vd_write(out + i, s0 + centre * gsf__vd_read(rows[half] + i));
+        gsf__vd_write(out + i + lanes, s1 + centre * gsf__vd_read(rows[half] + i + lanes));
+        if (i + step == n) return;
+    }
+    for (size_t i = 0; i < n; i++) {
+        double sum = weights[0] * (rows[0][i] + rows[last][i]);
+        for (int t = 1; t < half; t++) sum += weights[t] * (rows[t][i] + rows[last - t][i]);
+        out[i] = sum + weights[half] * rows[half][i];
+    }
+}
+
+GSF__V_INLINE gsf__vd GSF__V(gsf__ssim_one)(const gsf__ssim_form* form, gsf__vd ma, gsf__vd mb, gsf__vd maa, gsf__vd mbb,
+                                            gsf__vd mab) {
+    const gsf__vd c1 = gsf__vd_set(0.01 * 0.01), c2 = gsf__vd_set(0.03 * 0.03), zero = gsf__vd_set(0.0);
+    const gsf__vd two = gsf__vd_set(2.0), factor = gsf__vd_set(form->factor);
+    gsf__vd va = maa - ma * ma, vb = mbb - mb * mb;
+    if (form->clamp) {
+        va = gsf__vd_max(zero, va);
+        vb = gsf__vd_max(zero, vb);
+    }
+    const gsf__vd covariance = two * ((mab - ma * mb) * factor) + c2, variances = va * factor + vb * factor + c2;
+    if (form->contrast) return covariance / variances;
+    return ((two * ma * mb + c1) * covariance) / ((ma * ma + mb * mb + c1) * variances);
+}
+
+// The values of n pixels from the rows of `map`, `pitch` apart: means of a, b, aa, bb (unless they come together) and ab.
+GSF__V_KERNEL void GSF__V(gsf__ssim_value)(const gsf__ssim_form* form, const double* map, size_t pitch, size_t n, double* out) {
+    const size_t lanes = GSF__LANES / GSF__HALVES;
+    const double *b = map + pitch, *aa = b + pitch, *bb = aa + pitch, *ab = form->together ? bb : bb + pitch;
+    for (size_t i = 0; n >= lanes; i = i + 2 * lanes <= n ? i + lanes : n - lanes) {
+        const gsf__vd both = form->together ? gsf__vd_set(0.0) : gsf__vd_read(bb + i);
+        const gsf__vd mab = gsf__vd_read(ab + i);
+        gsf__vd_write(out + i, GSF__V(gsf__ssim_one)(form, gsf__vd_read(map + i), gsf__vd_read(b + i), gsf__vd_read(aa + i),
+                                                     both, mab));
+        if (i + lanes == n) return;
+    }
+    for (size_t i = 0; i < n; i++)
+        out[i] = gsf__ssim_one_scalar(form, map[i], b[i], aa[i], form->together ? 0.0 : bb[i], ab[i]);
+}
+
+#endif // GSF__KERNELS_METRICS
+
 #ifdef GSF__KERNELS_POWERS
 #if GSF__LANES > 1
 
@@ -5094,7 +5193,7 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
 #endif // GSF__KERNELS_POWERS
 
 #ifndef GSF__ISA
-#ifndef GSF__POWERS_INCLUDED
+#if !defined(GSF__POWERS_INCLUDED) && !defined(GSF__KERNELS)
 #define GSF__POWERS_INCLUDED
 #define GSF__KERNELS "gsfixer.h"
 #define GSF__KERNELS_POWERS

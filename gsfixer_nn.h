@@ -15445,6 +15445,194 @@ GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* de
 // ---- >>nn metrics ---------------------------------------------------------------
 // Networks that compare images, channels-last as in >>nn convolution. Every score is summed in double.
 
+// ---- metrics: kernels of feature maps
+
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_MAPS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_MAPS
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_MAPS
+
+GSF__V_INLINE gsf__vf GSF__V(gsf__v_rectify)(gsf__vf x) { return gsf__v_max(gsf__v_set(0.0f), x); } // a NaN remains
+
+GSF__V_KERNEL void GSF__V(gsf__map_rectify)(const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__v_store_first(y + i, GSF__V(gsf__v_rectify)(gsf__v_load_first(x + i, left)), left);
+    }
+}
+
+// y = max(x, y), where a NaN in either remains
+GSF__V_KERNEL void GSF__V(gsf__map_raise)(const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf a = gsf__v_load_first(x + i, left), b = gsf__v_load_first(y + i, left);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_eq(b, b), gsf__v_max(b, a), b), left);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__map_add)(const float* x, int64_t count, float* y) { // y += x
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__v_store_first(y + i, gsf__v_load_first(y + i, left) + gsf__v_load_first(x + i, left), left);
+    }
+}
+
+// y *= slope where y < 0; slopes: per channel, NULL: `leak` for all
+GSF__V_KERNEL void GSF__V(gsf__map_leak)(const float* slopes, float leak, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf v = gsf__v_load_first(y + i, left);
+        const gsf__vf slope = slopes ? gsf__v_load_first(slopes + i, left) : gsf__v_set(leak);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_lt(v, gsf__v_set(0.0f)), v * slope, v), left);
+    }
+}
+
+// y = (y - mean) * factor, then as gsf__map_leak. means: (2, channels) whose sum is the mean, so that subtracting a mean that
+// is large beside the deviation costs no digits
+GSF__V_KERNEL void GSF__V(gsf__map_scale)(const float* means, const float* factors, float leak, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf above = gsf__v_load_first(y + i, left) - gsf__v_load_first(means + i, left);
+        const gsf__vf v = (above - gsf__v_load_first(means + count + i, left)) * gsf__v_load_first(factors + i, left);
+        gsf__v_store_first(y + i, gsf__v_select(gsf__v_lt(v, gsf__v_set(0.0f)), v * gsf__v_set(leak), v), left);
+    }
+}
+
+// The sum and the sum of squares of each channel of `pixels` pixels: sums (channels rounded up to whole vectors, 2)
+GSF__V_KERNEL void GSF__V(gsf__map_moments)(const float* x, int64_t pixels, int64_t channels, int64_t pitch, double* sums) {
+    for (int64_t c = 0; c < channels; c += GSF__LANES) {
+        const size_t left = (size_t)(channels - c);
+        gsf__vd sum[GSF__HALVES], square[GSF__HALVES];
+        for (int h = 0; h < GSF__HALVES; h++) sum[h] = square[h] = gsf__vd_set(0.0);
+        for (int64_t i = 0; i < pixels; i++) {
+            const gsf__vf v = gsf__v_load_first(x + i * pitch + c, left);
+            for (int h = 0; h < GSF__HALVES; h++) {
+                const gsf__vd d = gsf__vd_half(v, h);
+                sum[h] = sum[h] + d;
+                square[h] = gsf__vd_madd(d, d, square[h]);
+            }
+        }
+        double a[GSF__LANES], b[GSF__LANES];
+        memcpy(a, sum, sizeof a);
+        memcpy(b, square, sizeof b);
+        for (int i = 0; i < GSF__LANES; i++, sums += 2) {
+            sums[0] = a[i];
+            sums[1] = b[i];
+        }
+    }
+}
+
+// y = by * the bilinear mix of four pixels at the shares u and v of their second column and row
+GSF__V_KERNEL void GSF__V(gsf__map_mix)(const float* const corners[4], float u, float v, float by, int64_t count, float* y) {
+    const gsf__vf across = gsf__v_set(u), down = gsf__v_set(v), factor = gsf__v_set(by);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf a = gsf__v_load_first(corners[0] + i, left), b = gsf__v_load_first(corners[1] + i, left);
+        const gsf__vf c = gsf__v_load_first(corners[2] + i, left), d = gsf__v_load_first(corners[3] + i, left);
+        const gsf__vf top = gsf__v_madd(b - a, across, a), bottom = gsf__v_madd(d - c, across, c);
+        gsf__v_store_first(y + i, factor * gsf__v_madd(bottom - top, down, top), left);
+    }
+}
+
+// The product of a pixel with each of `pixels` others, `pitch` apart
+GSF__V_KERNEL void GSF__V(gsf__map_products)(const float* from, const float* to, int64_t pixels, int64_t pitch, int64_t count,
+                                             float scale, float* out) {
+    for (int64_t p = 0; p < pixels; p++, to += pitch) {
+        gsf__vf sum = gsf__v_set(0.0f), other = sum;
+        int64_t i = 0;
+        for (; i + 2 * GSF__LANES <= count; i += 2 * GSF__LANES) {
+            sum = gsf__v_madd(gsf__v_load(from + i), gsf__v_load(to + i), sum);
+            other = gsf__v_madd(gsf__v_load(from + i + GSF__LANES), gsf__v_load(to + i + GSF__LANES), other);
+        }
+        for (; i < count; i += GSF__LANES) {
+            const size_t left = (size_t)(count - i);
+            sum = gsf__v_madd(gsf__v_load_first(from + i, left), gsf__v_load_first(to + i, left), sum);
+        }
+        out[p] = scale * gsf__v_sum(sum + other);
+    }
+}
+
+// The sum over channels of w (a / |a| - b / |b|)^2 of the rectified features of a pixel, in double.
+GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b, const float* w, int64_t count) {
+    gsf__vd of_a[GSF__HALVES], of_b[GSF__HALVES], sums[GSF__HALVES];
+    for (int h = 0; h < GSF__HALVES; h++) of_a[h] = of_b[h] = sums[h] = gsf__vd_set(0.0);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf x = GSF__V(gsf__v_rectify)(gsf__v_load_first(a + i, left));
+        const gsf__vf y = GSF__V(gsf__v_rectify)(gsf__v_load_first(b + i, left));
+        for (int h = 0; h < GSF__HALVES; h++) {
+            const gsf__vd u = gsf__vd_half(x, h), v = gsf__vd_half(y, h);
+            of_a[h] = gsf__vd_madd(u, u, of_a[h]);
+            of_b[h] = gsf__vd_madd(v, v, of_b[h]);
+        }
+    }
+    double square_a = 0.0, square_b = 0.0, sum = 0.0;
+    for (int h = 0; h < GSF__HALVES; h++) {
+        square_a += gsf__vd_sum(of_a[h]);
+        square_b += gsf__vd_sum(of_b[h]);
+    }
+    const gsf__vd by_a = gsf__vd_set(1.0 / (sqrt(square_a) + 1e-10)), by_b = gsf__vd_set(1.0 / (sqrt(square_b) + 1e-10));
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf x = GSF__V(gsf__v_rectify)(gsf__v_load_first(a + i, left));
+        const gsf__vf y = GSF__V(gsf__v_rectify)(gsf__v_load_first(b + i, left)), of = gsf__v_load_first(w + i, left);
+        for (int h = 0; h < GSF__HALVES; h++) {
+            const gsf__vd d = gsf__vd_half(x, h) * by_a - gsf__vd_half(y, h) * by_b;
+            sums[h] = gsf__vd_madd(gsf__vd_half(of, h) * d, d, sums[h]);
+        }
+    }
+    for (int h = 0; h < GSF__HALVES; h++) sum += gsf__vd_sum(sums[h]);
+    return sum;
+}
+
+// For Winograd's convolution (below): the factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next).
+GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
+    for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
+        const size_t left = (size_t)(c - i);
+#define GSF_X(j)                                                                                          \
+        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left);                                \
+        const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, left);                                \
+        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left);                                \
+        const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, left);                                \
+        const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+#define GSF_X(k)                                                             \
+        gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
+        gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
+        gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
+        gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+    }
+}
+
+// 2 x 2 pixels of n outputs from the products m (16, next) and the bias: y[0..3], NULL for a pixel beyond the border.
+GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, const float* bias, int64_t n,
+                                                float* const y[4]) {
+    for (int64_t i = 0; i < n; i += GSF__LANES, m += GSF__LANES) {
+        const size_t left = (size_t)(n - i);
+        const gsf__vf b = gsf__v_load_first(bias + i, left);
+#define GSF_X(k)                                                                                       \
+        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);        \
+        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next); \
+        const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+        gsf__v_store_first(y[0] + i, ((t0 + t1) + t2) + b, left);
+        if (y[1]) gsf__v_store_first(y[1] + i, ((t1 - t2) - t3) + b, left);
+        if (y[2]) gsf__v_store_first(y[2] + i, ((u0 + u1) + u2) + b, left);
+        if (y[3]) gsf__v_store_first(y[3] + i, ((u1 - u2) - u3) + b, left);
+    }
+}
+
+#endif // GSF__KERNELS_MAPS
+#ifndef GSF__ISA
+
 // ---- metrics: layers of feature maps
 
 typedef struct gsf__map { // (images, height, width, channels)
@@ -15458,17 +15646,36 @@ static size_t gsf__map_count(const gsf__map* map) {
                            gsf__nn_product((size_t)map->width, (size_t)map->channels));
 }
 
+typedef struct gsf__map_packed { // weights of a convolution
+    const void* key;             // where they are in their file
+    float* packed;
+} gsf__map_packed;
+
+typedef struct gsf__map_layers { // a network's convolutions
+    gsf__nn_workspace scratch;   // bordered input, products
+    gsf__map_packed* packed;     // weights, packed when their layer first runs
+    size_t count, room;
+} gsf__map_layers;
+
+static void gsf__destroy_map_layers(gsf_context* ctx, gsf__map_layers* layers) {
+    for (size_t i = 0; i < layers->count; i++) gsf_free(ctx, layers->packed[i].packed);
+    gsf_free(ctx, layers->packed);
+    gsf__nn_destroy_workspace(ctx, &layers->scratch);
+    memset(layers, 0, sizeof *layers);
+}
+
 typedef struct gsf__maps { // buffers of a network, reused from image to image
     gsf_context* ctx;
-    gsf__nn_workspace rooms[2], conv; // the maps that a layer reads and writes; its weights and bordered input
-    int room;                         // that of the current map
+    gsf__nn_workspace rooms[2]; // the maps that a layer reads and writes
+    gsf__map_layers layers;
+    int room;                   // that of the current map
     gsf__map now;
 } gsf__maps;
 
 static void gsf__destroy_maps(gsf_context* ctx, gsf__maps* maps) {
     gsf__nn_destroy_workspace(ctx, &maps->rooms[0]);
     gsf__nn_destroy_workspace(ctx, &maps->rooms[1]);
-    gsf__nn_destroy_workspace(ctx, &maps->conv);
+    gsf__destroy_map_layers(ctx, &maps->layers);
 }
 
 // Gives `map` the memory of the room that the current map does not use.
@@ -15487,7 +15694,7 @@ typedef struct gsf__map_fill { // the input, dense and with `pad` columns of zer
     const gsf__map* x;
     float* out;
     int64_t image, pad;
-    int rectify; // ReLU
+    void (*rectify)(const float* x, int64_t count, float* y); // ReLU, or NULL
 } gsf__map_fill;
 
 static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
@@ -15500,9 +15707,11 @@ static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
     memset(out, 0, (size_t)edge * sizeof(float));
     memset(out + edge + count, 0, (size_t)edge * sizeof(float));
     out += edge;
-    for (int64_t i = 0; i < (map->pitch == c ? 1 : map->width); i++)
-        memcpy(out + i * c, x + i * map->pitch, (size_t)(map->pitch == c ? count : c) * sizeof(float));
-    for (int64_t i = 0; i < count && job->rectify; i++) out[i] = out[i] < 0.0f ? 0.0f : out[i]; // a NaN remains
+    const int64_t runs = map->pitch == c ? 1 : map->width, length = map->pitch == c ? count : c;
+    for (int64_t i = 0; i < runs; i++, x += map->pitch, out += c) {
+        if (job->rectify) job->rectify(x, length, out);
+        else memcpy(out, x, (size_t)length * sizeof(float));
+    }
 }
 
 typedef struct gsf__map_conv { // a convolution; kernel and channels are those of the weight
@@ -15511,20 +15720,203 @@ typedef struct gsf__map_conv { // a convolution; kernel and channels are those o
     int rectify;              // ReLU of the input
     int64_t above, left;      // rows before and columns within the padded input at which output 0 begins
     int64_t ldo, out_row;     // floats from pixel to pixel, and from row to row, of the output
+    const void* key;          // of the packed weights
 } gsf__map_conv;
 
+/* A convolution by 3 x 3 at stride 1 takes 4 instead of 9 products per value, input and output channel by Winograd's
+   F(2 x 2, 3 x 3) (Lavin and Gray 2016): with d, a tile of 4 x 4 pixels whose corners are 2 apart, and g, the kernel,
+
+       2 x 2 outputs = A' ((G g G') * (B' d B)) A      G = 1   0   0     B' = 1  0 -1  0     A' = 1  1  1  0
+                                                           .5  .5 .5          0  1  1  0          0  1 -1 -1
+                                                           .5 -.5 .5          0 -1  1  0
+                                                           0   0   1          0  1  0 -1
+   where * multiplies point by point and adds up over input channels. Each of the 16 points is a matrix product of its own,
+   tiles by channels by outputs. Work is divided into segments of up to 240 tiles, which hold all factors and products of
+   their tiles: weights, (16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so that rounding
+   errors stay those of a sum of products. */
+
+enum { GSF__WINOGRAD_POINTS = 16,
+       GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // tiles of a segment: least, most; multiples of M and M10
+       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that more than the least number of tiles may take
+
+static int64_t gsf__winograd_packed(const gsf__conv_layer* layer) { // floats: biases, weights
+    return gsf__conv_blocks(layer) * GSF__CONV_N * (1 + GSF__WINOGRAD_POINTS * layer->in);
+}
+
+static void gsf__winograd_pack_block(void* arg, size_t block, int32_t worker) { // sixteen outputs
+    static const double g[4][3] = {{1.0, 0.0, 0.0}, {0.5, 0.5, 0.5}, {0.5, -0.5, 0.5}, {0.0, 0.0, 1.0}};
+    const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
+    const gsf__conv_layer* layer = job->layer;
+    const int64_t first = (int64_t)block * GSF__CONV_N, n_end = gsf__least(layer->out - first, GSF__CONV_N);
+    const int64_t panel = GSF__CONV_N * layer->in, blocks = gsf__conv_blocks(layer);
+    float *bias = job->out + first, *to = job->out + blocks * GSF__CONV_N + (int64_t)block * panel;
+    (void)worker;
+    memset(bias, 0, GSF__CONV_N * sizeof(float));
+    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, bias);
+    for (int64_t c = 0; c < layer->in; c++)
+        for (int64_t n = 0; n < GSF__CONV_N; n++) {
+            float values[9] = {0};
+            double rows[4][3];
+            if (n < n_end) gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c) * 9, 9, values);
+            for (int i = 0; i < 4; i++)
+                for (int x = 0; x < 3; x++)
+                    rows[i][x] = g[i][0] * (double)values[x] + g[i][1] * (double)values[3 + x] +
+                                 g[i][2] * (double)values[6 + x];
+            for (int p = 0; p < GSF__WINOGRAD_POINTS; p++)
+                to[p * blocks * panel + c * GSF__CONV_N + n] =
+                    (float)(rows[p / 4][0] * g[p % 4][0] + rows[p / 4][1] * g[p % 4][1] + rows[p / 4][2] * g[p % 4][2]);
+        }
+}
+
+typedef struct gsf__winograd_job { // of one image
+    const gsf__conv_kernels* kernels;
+    void (*spread)(const float* const rows[4], int64_t c, float* v, int64_t next);
+    void (*gather)(const float* m, int64_t next, const float* bias, int64_t n, float* const y[4]);
+    const float *x, *zeros;        // the bordered image; four pixels
+    const float *bias, *weights;
+    int64_t in, out, blocks;       // channels; panels of 16 outputs
+    int64_t height, width, across; // across: tiles
+    int64_t tiles, segment;        // of the image; of a segment
+    float* y;
+    int64_t ldo, out_row;
+    float* workers;
+    size_t per_worker;             // floats: factors (16, segment, in), products (16, blocks, segment, 16)
+} gsf__winograd_job;
+
+static void gsf__winograd_multiply(const gsf__winograd_job* job, int64_t count, const float* v, float* m) {
+    const int64_t panel = job->in * GSF__CONV_N, sums = job->segment * GSF__CONV_N;
+    for (int64_t p = 0; p < GSF__WINOGRAD_POINTS; p++, v += job->segment * job->in)
+        for (int64_t block = 0, step; block < job->blocks; block += step, m += step * sums) {
+            const float* b = job->weights + (p * job->blocks + block) * panel;
+            step = job->kernels->multiply_two && block + 1 < job->blocks ? 2 : 1;
+            memset(m, 0, (size_t)(step * sums) * sizeof(float));
+            for (int64_t k0 = 0; k0 < job->in; k0 += GSF__CONV_K) {
+                const int64_t k = gsf__least(job->in - k0, GSF__CONV_K);
+                const float *panels = b + k0 * GSF__CONV_N, *ahead = panels + step * k * GSF__CONV_N;
+                if (step == 2)
+                    job->kernels->multiply_two(v + k0, job->in, count, panels, panel, k, m, sums, ahead);
+                else job->kernels->multiply(v + k0, job->in, count, panels, k, m, ahead);
+            }
+        }
+}
+
+static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
+    const gsf__winograd_job* job = (const gsf__winograd_job*)arg;
+    const int64_t first = (int64_t)segment * job->segment, count = gsf__least(job->tiles - first, job->segment);
+    const int64_t row = (job->width + 2) * job->in, next = job->blocks * job->segment * GSF__CONV_N;
+    float* v = job->workers + (size_t)worker * job->per_worker;
+    float* m = v + GSF__WINOGRAD_POINTS * job->segment * job->in;
+    for (int64_t t = 0; t < count; t++) {
+        const int64_t y = (first + t) / job->across * 2 - 1, x = (first + t) % job->across * 2;
+        const float* rows[4];
+        for (int64_t i = 0; i < 4; i++)
+            rows[i] = y + i < 0 || y + i >= job->height ? job->zeros : job->x + (y + i) * row + x * job->in;
+        job->spread(rows, job->in, v + t * job->in, job->segment * job->in);
+    }
+    gsf__winograd_multiply(job, count, v, m);
+    for (int64_t block = 0; block < job->blocks; block++)
+        for (int64_t t = 0; t < count; t++) {
+            const int64_t y = (first + t) / job->across * 2, x = (first + t) % job->across * 2, n0 = block * GSF__CONV_N;
+            float* to = job->y + y * job->out_row + x * job->ldo + n0;
+            const int right = x + 1 < job->width, below = y + 1 < job->height;
+            float* const pixels[4] = {to, right ? to + job->ldo : NULL, below ? to + job->out_row : NULL,
+                                      right && below ? to + job->out_row + job->ldo : NULL};
+            job->gather(m + (block * job->segment + t) * GSF__CONV_N, next, job->bias + n0,
+                        gsf__least(job->out - n0, GSF__CONV_N), pixels);
+        }
+}
+
+// Tiles of a segment: as many as fit.
+static int64_t gsf__winograd_tiles(const gsf__conv_layer* layer, int64_t tiles) {
+    const int64_t each = GSF__WINOGRAD_POINTS * (layer->in + gsf__conv_blocks(layer) * GSF__CONV_N);
+    int64_t most = GSF__WINOGRAD_ROOM / each / GSF__WINOGRAD_STEP * GSF__WINOGRAD_STEP;
+    if (most < GSF__WINOGRAD_STEP) most = GSF__WINOGRAD_STEP;
+    return gsf__even_piece(tiles, gsf__least(most, GSF__WINOGRAD_TILES), GSF__WINOGRAD_STEP);
+}
+
+// Where it pays: with few channels the sums of the tiles take longer than the products that they save.
+static int gsf__is_winograd(const gsf__map_conv* c, const gsf__conv_layer* layer, const gsf__map* x, const gsf__map* y) {
+    return layer->kernel == 3 && c->stride == 1 && c->pad == 1 && c->above == 1 && c->left == 0 && x->height == y->height &&
+           x->width == y->width && layer->in >= 16 && layer->out >= 16;
+}
+
+static float* gsf__map_find_packed(const gsf__map_layers* layers, const void* key) { // NULL: not packed yet
+    for (size_t i = 0; i < layers->count; i++)
+        if (layers->packed[i].key == key) return layers->packed[i].packed;
+    return NULL;
+}
+
+// The weights of a layer, packed for `winograd` or not; NULL when out of memory.
+static const float* gsf__map_pack(gsf_context* ctx, gsf__map_layers* layers, const gsf__conv_layer* layer, const void* key,
+                                  int winograd) {
+    gsf__conv_pack_job job = {layer, gsf__map_find_packed(layers, key)};
+    if (job.out) return job.out;
+    const size_t count = (size_t)(winograd ? gsf__winograd_packed(layer) : gsf__conv_packed(layer));
+    if (gsf__reserve(ctx, (void**)&layers->packed, &layers->room, layers->count, layers->count + 1, sizeof *layers->packed))
+        return NULL;
+    job.out = (float*)gsf_alloc(ctx, count, sizeof(float));
+    if (!job.out) return NULL;
+    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), winograd ? gsf__winograd_pack_block : gsf__conv_pack_block, &job);
+    layers->packed[layers->count].key = key;
+    layers->packed[layers->count++].packed = job.out;
+    return job.out;
+}
+
+static void gsf__map_winograd(gsf_context* ctx, const gsf__map_conv* c, const gsf__conv_layer* layer, const float* packed,
+                              gsf__map_fill* fill, float* workers, const gsf__map* y) {
+    gsf__winograd_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
+    job.spread = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_spread);
+    job.gather = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_gather);
+    job.in = layer->in;
+    job.out = layer->out;
+    job.blocks = gsf__conv_blocks(layer);
+    job.height = y->height;
+    job.width = y->width;
+    job.across = (y->width + 1) / 2;
+    job.tiles = job.across * ((y->height + 1) / 2);
+    job.segment = gsf__winograd_tiles(layer, job.tiles);
+    job.x = fill->out;
+    job.bias = packed;
+    job.weights = packed + job.blocks * GSF__CONV_N;
+    job.ldo = c->ldo;
+    job.out_row = c->out_row;
+    job.workers = workers;
+    job.per_worker = (size_t)(GSF__WINOGRAD_POINTS * job.segment * (job.in + job.blocks * GSF__CONV_N));
+    float* zeros = fill->out + y->height * (y->width + 2) * job.in; // also right of the last row, in a tile cut by the border
+    memset(zeros, 0, (size_t)(4 * job.in) * sizeof(float));
+    job.zeros = zeros;
+    for (; fill->image < fill->x->images; fill->image++) {
+        gsf__parallel_for(ctx, (size_t)y->height, gsf__map_fill_row, fill);
+        job.y = y->data + fill->image * y->height * y->width * y->pitch;
+        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.tiles, job.segment), gsf__winograd_segment, &job);
+    }
+}
+
 // Writes y, of the sizes given there; y may be a part of x.
-static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__map_conv* c,
-                                       const gsf__map* x, const gsf__map* y) {
+static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__map_layers* layers, const gsf__map_conv* c, const gsf__map* x,
+                                       const gsf__map* y) {
     const gsf_nn_tensor* w = c->layer->weight;
     gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2]};
-    const int64_t across = x->width + 2 * c->pad, bordered = x->height * across * layer.in;
-    float* memory = (float*)gsf__nn_scratch(ctx, workspace,
-                                            ((size_t)gsf__conv_packed(&layer) + (size_t)bordered) * sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    const int64_t across = x->width + 2 * c->pad;
+    const int winograd = gsf__is_winograd(c, &layer, x, y);
+    size_t floats = (size_t)(x->height * across * layer.in);
+    if (winograd) {
+        const int64_t segment = gsf__winograd_tiles(&layer, (y->width + 1) / 2 * ((y->height + 1) / 2));
+        floats += (size_t)(4 * layer.in) + (size_t)ctx->parallel.worker_count * (size_t)(GSF__WINOGRAD_POINTS * segment) *
+                                               (size_t)(layer.in + gsf__conv_blocks(&layer) * GSF__CONV_N);
+    }
+    float* memory = (float*)gsf__nn_scratch(ctx, &layers->scratch, floats * sizeof(float));
+    const float* packed = memory ? gsf__map_pack(ctx, layers, &layer, c->key, winograd) : NULL;
+    if (!packed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__map_fill fill = {x, memory, 0, c->pad, NULL};
+    if (c->rectify) fill.rectify = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__map_rectify);
+    if (winograd) {
+        gsf__map_winograd(ctx, c, &layer, packed, &fill, memory + x->height * across * layer.in + 4 * layer.in, y);
+        return GSF_OK;
+    }
     gsf__conv_job job;
-    gsf__map_fill fill = {x, memory, 0, c->pad, c->rectify};
-    gsf__conv_pack(ctx, &layer, memory + bordered);
     memset(&job, 0, sizeof job);
     job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
     job.in[0] = memory;
@@ -15537,7 +15929,7 @@ static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* work
     job.k = layer.kernel * layer.in;
     job.stride = c->stride;
     job.pad = c->above;
-    job.packed = memory + bordered;
+    job.packed = packed;
     job.panel = gsf__conv_panel(&layer);
     job.height = y->height;
     job.width = y->width;
@@ -15553,10 +15945,10 @@ static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__nn_workspace* work
     return GSF_OK;
 }
 
-static gsf_result gsf__map_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_layer* layer,
-                                    int64_t stride, int64_t pad, int rectify, const gsf__map* x, const gsf__map* y) {
-    const gsf__map_conv c = {layer, stride, pad, rectify, pad, 0, y->pitch, y->width * y->pitch};
-    return gsf__map_convolve_at(ctx, workspace, &c, x, y);
+static gsf_result gsf__map_convolve(gsf_context* ctx, gsf__map_layers* layers, const gsf__nn_layer* layer, int64_t stride,
+                                    int64_t pad, int rectify, const gsf__map* x, const gsf__map* y) {
+    const gsf__map_conv c = {layer, stride, pad, rectify, pad, 0, y->pitch, y->width * y->pitch, layer->weight->data};
+    return gsf__map_convolve_at(ctx, layers, &c, x, y);
 }
 
 // Convolves the current map into a new one, which becomes the current one.
@@ -15568,7 +15960,7 @@ static gsf_result gsf__map_conv_next(gsf__maps* maps, const gsf__nn_layer* layer
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "%s: %lld x %lld values are too few", w->name,
                         (long long)maps->now.width, (long long)maps->now.height);
     GSF__TRY(gsf__map_make(maps, &y));
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, layer, stride, pad, rectify, &maps->now, &y));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, layer, stride, pad, rectify, &maps->now, &y));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -15691,6 +16083,7 @@ static void gsf__lpips_close(gsf_context* ctx, void* state) {
 typedef struct gsf__map_pool_job {
     const gsf__map *x, *y;
     int64_t kernel;
+    void (*raise)(const float* x, int64_t count, float* y);
 } gsf__map_pool_job;
 
 static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima of windows, 2 apart, cut at the border
@@ -15706,8 +16099,7 @@ static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima
             for (int64_t u = x0; u < x1; u++) {
                 const float* from = x->data + ((image * x->height + v) * x->width + u) * c;
                 if (v == y0 && u == x0) memcpy(out, from, (size_t)c * sizeof(float));
-                else
-                    for (int64_t i = 0; i < c; i++) out[i] = from[i] <= out[i] ? out[i] : from[i]; // a NaN remains
+                else job->raise(from, c, out);
             }
     }
 }
@@ -15722,7 +16114,7 @@ static gsf_result gsf__map_pool_next(gsf__maps* maps, int64_t kernel, int up) {
     const gsf__map x = maps->now;
     gsf__map y = {NULL, x.images, gsf__pool_size(x.height, kernel, up), gsf__pool_size(x.width, kernel, up), x.channels,
                   x.channels};
-    gsf__map_pool_job job = {&x, &y, kernel};
+    gsf__map_pool_job job = {&x, &y, kernel, GSF__WIDE_KERNEL_OF(maps->ctx->cpu_level, gsf__map_raise)};
     if (y.height < 1 || y.width < 1)
         return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "max pool: %lld x %lld values are too few", (long long)x.width,
                         (long long)x.height);
@@ -15740,9 +16132,9 @@ static gsf_result gsf__lpips_fire(gsf__maps* maps, const gsf__nn_layer* layers) 
     y.channels = y.pitch = one + three;
     GSF__TRY(gsf__map_make(maps, &y));
     gsf__map part = y;
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[1], 1, 0, 1, &maps->now, &part));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, &layers[1], 1, 0, 1, &maps->now, &part));
     part.data += one;
-    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->conv, &layers[2], 1, 1, 1, &maps->now, &part));
+    GSF__TRY(gsf__map_convolve(maps->ctx, &maps->layers, &layers[2], 1, 1, 1, &maps->now, &part));
     gsf__map_use(maps, &y);
     return gsf__check_cancel(maps->ctx);
 }
@@ -15751,16 +16143,8 @@ typedef struct gsf__lpips_tap_job {
     const gsf__map* map; // of two images
     const float* weights;
     double* partial;     // (height)
+    double (*distance)(const float* a, const float* b, const float* w, int64_t count);
 } gsf__lpips_tap_job;
-
-static double gsf__lpips_norm(const float* x, int64_t count) { // of the rectified features
-    double sums[4] = {0.0, 0.0, 0.0, 0.0};
-    for (int64_t i = 0; i < count; i++) {
-        const double v = x[i] < 0.0f ? 0.0 : (double)x[i];
-        sums[i & 3] += v * v;
-    }
-    return sqrt(sums[0] + sums[1] + (sums[2] + sums[3])) + 1e-10;
-}
 
 static void gsf__lpips_tap_row(void* arg, size_t row, int32_t worker) {
     const gsf__lpips_tap_job* job = (const gsf__lpips_tap_job*)arg;
@@ -15768,15 +16152,7 @@ static void gsf__lpips_tap_row(void* arg, size_t row, int32_t worker) {
     const float *a = job->map->data + (int64_t)row * width * c, *b = a + job->map->height * width * c;
     double sum = 0.0;
     (void)worker;
-    for (int64_t x = 0; x < width; x++, a += c, b += c) {
-        const double of_a = 1.0 / gsf__lpips_norm(a, c), of_b = 1.0 / gsf__lpips_norm(b, c);
-        double sums[4] = {0.0, 0.0, 0.0, 0.0};
-        for (int64_t i = 0; i < c; i++) {
-            const double d = (a[i] < 0.0f ? 0.0 : (double)a[i]) * of_a - (b[i] < 0.0f ? 0.0 : (double)b[i]) * of_b;
-            sums[i & 3] += (double)job->weights[i] * d * d;
-        }
-        sum += sums[0] + sums[1] + (sums[2] + sums[3]);
-    }
+    for (int64_t x = 0; x < width; x++, a += c, b += c) sum += job->distance(a, b, job->weights, c);
     job->partial[row] = sum;
 }
 
@@ -15787,7 +16163,7 @@ static gsf_result gsf__lpips_measure_tap(gsf__lpips* net, const gsf_nn_tensor* w
     GSF__TRY(gsf__reserve(ctx, (void**)&net->partial, &net->partial_room, 0, (size_t)map->height, sizeof(double)));
     GSF__TRY(gsf__reserve(ctx, (void**)&net->vectors, &net->vectors_room, 0, (size_t)weight->count, sizeof(float)));
     gsf_nn_convert_tensor(weight, 0, weight->count, net->vectors);
-    gsf__lpips_tap_job job = {map, net->vectors, net->partial};
+    gsf__lpips_tap_job job = {map, net->vectors, net->partial, GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__lpips_distance)};
     gsf__parallel_for(ctx, (size_t)map->height, gsf__lpips_tap_row, &job);
     double sum = 0.0;
     for (int64_t i = 0; i < map->height; i++) sum += net->partial[i];
@@ -16252,7 +16628,8 @@ typedef struct gsf__amt {
     gsf__amt_conv merge[2];
     gsf_context* ctx;
     const gsf__nn_tap* tap;
-    gsf__nn_workspace conv, rooms[GSF__AMT_ROOMS]; // maps in the order of their making, reused by the next pair
+    gsf__map_layers layers;
+    gsf__nn_workspace rooms[GSF__AMT_ROOMS]; // maps in the order of their making, reused by the next pair
     int room;
     // the stream
     gsf_image even, odd, middle; // the last frame of even number, the one after it (u8), and that as it should be
@@ -16286,35 +16663,70 @@ static gsf__map gsf__map_image(const gsf__map* map, int64_t index) {
     return image;
 }
 
+typedef struct gsf__map_kernels {
+    void (*add)(const float* x, int64_t count, float* y);
+    void (*leak)(const float* slopes, float leak, int64_t count, float* y);
+    void (*scale)(const float* means, const float* factors, float leak, int64_t count, float* y);
+    void (*moments)(const float* x, int64_t pixels, int64_t channels, int64_t pitch, double* sums);
+    void (*mix)(const float* const corners[4], float u, float v, float by, int64_t count, float* y);
+    void (*products)(const float* from, const float* to, int64_t pixels, int64_t pitch, int64_t count, float scale, float* out);
+} gsf__map_kernels;
+
+static const gsf__map_kernels* gsf__map_kernels_of(gsf_cpu_level level) {
+#define GSF_X(isa)                                                                                                       \
+    static const gsf__map_kernels isa = {gsf__map_add_##isa, gsf__map_leak_##isa, gsf__map_scale_##isa,                  \
+                                         gsf__map_moments_##isa, gsf__map_mix_##isa, gsf__map_products_##isa}
+    GSF_X(scalar);
+#if GSF__X86
+    GSF_X(avx2);
+    GSF_X(avx512);
+    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+#undef GSF_X
+    (void)level;
+    return &scalar;
+}
+
 typedef struct gsf__amt_row_job { // of elementwise layers
+    const gsf__map_kernels* kernels;
     const gsf__map *x, *x2, *y;
-    const float* slope; // per channel, or one for all
-    float leak;
-    double scale;       // of a resize: pixels of x per pixel of y
+    const float* slope;            // per channel, or NULL
+    float leak;                    // one for all
+    double scale;                  // of a resize: pixels of x per pixel of y
     float by;
-    const double* moments;
+    double* moments;               // (rows, channels in whole vectors, 2)
+    const float *means, *factors;  // (images, 2, channels), (images, channels)
 } gsf__amt_row_job;
+
+static gsf__amt_row_job gsf__amt_begin(const gsf__amt* net, const gsf__map* x, const gsf__map* y) {
+    gsf__amt_row_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__map_kernels_of(net->ctx->cpu_level);
+    job.x = x;
+    job.y = y;
+    return job;
+}
 
 static float* gsf__map_row(const gsf__map* map, size_t row) { return map->data + (int64_t)row * map->width * map->pitch; }
 
 static void gsf__amt_activate_row(void* arg, size_t row, int32_t worker) { // in place: x < 0 times its slope
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const int64_t c = job->y->channels, width = job->y->width;
     float* y = gsf__map_row(job->y, row);
     (void)worker;
-    for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++)
-            y[c] = y[c] < 0.0f ? y[c] * (job->slope ? job->slope[c] : job->leak) : y[c];
+    if (!job->slope && job->y->pitch == c) job->kernels->leak(NULL, job->leak, width * c, y);
+    else
+        for (int64_t x = 0; x < width; x++) job->kernels->leak(job->slope, job->leak, c, y + x * job->y->pitch);
 }
 
 // PReLU with a slope per channel; NULL: `leak` for all, which is 0 for ReLU.
 static gsf_result gsf__amt_activate(gsf__amt* net, const gsf_nn_tensor* slope, float leak, const gsf__map* y) {
     float slopes[1024];
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
+    gsf__amt_row_job job = gsf__amt_begin(net, NULL, y);
     if (slope && slope->count > 1024)
         return gsf_fail(net->ctx, GSF_ERROR_UNSUPPORTED, "%s: more than 1024 channels", slope->name);
     if (slope) gsf_nn_convert_tensor(slope, 0, slope->count, slopes);
-    job.y = y;
     job.slope = slope ? slopes : NULL;
     job.leak = leak;
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_activate_row, &job);
@@ -16331,27 +16743,22 @@ static void gsf__amt_copy_row(void* arg, size_t row, int32_t worker) {
 }
 
 static void gsf__amt_copy(gsf__amt* net, const gsf__map* x, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_copy_row, &job);
 }
 
 static void gsf__amt_add_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
+    const int64_t c = job->y->channels, dense = job->x->pitch == c && job->y->pitch == c;
     const float* x = gsf__map_row(job->x, row);
     float* y = gsf__map_row(job->y, row);
     (void)worker;
-    for (int64_t i = 0; i < job->y->width; i++, x += job->x->pitch, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++) y[c] += x[c];
+    for (int64_t i = 0; i < (dense ? 1 : job->y->width); i++, x += job->x->pitch, y += job->y->pitch)
+        job->kernels->add(x, dense ? job->y->width * c : c, y);
 }
 
 static void gsf__amt_add(gsf__amt* net, const gsf__map* x, const gsf__map* y) { // y += x
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_add_row, &job);
 }
 
@@ -16369,15 +16776,12 @@ static gsf__between gsf__look_between(double x, int64_t size) { // clamped to th
 }
 
 // y = by * bilinear interpolation of x (height and width of row 0) at a point; `channels` values
-static void gsf__map_sample(const gsf__map* x, gsf__between v, gsf__between u, float by, int64_t channels, float* y) {
-    const float *a = x->data + (v.low * x->width + u.low) * x->pitch,
-                *b = x->data + (v.low * x->width + u.high) * x->pitch;
-    const float *c = x->data + (v.high * x->width + u.low) * x->pitch,
-                *d = x->data + (v.high * x->width + u.high) * x->pitch;
-    for (int64_t i = 0; i < channels; i++) {
-        const float top = a[i] + (b[i] - a[i]) * u.share, bottom = c[i] + (d[i] - c[i]) * u.share;
-        y[i] = by * (top + (bottom - top) * v.share);
-    }
+static void gsf__map_sample(const gsf__map_kernels* kernels, const gsf__map* x, gsf__between v, gsf__between u, float by,
+                            int64_t channels, float* y) {
+    const float *top = x->data + v.low * x->width * x->pitch, *bottom = x->data + v.high * x->width * x->pitch;
+    const float* const corners[4] = {top + u.low * x->pitch, top + u.high * x->pitch, bottom + u.low * x->pitch,
+                                     bottom + u.high * x->pitch};
+    kernels->mix(corners, u.share, v.share, by, channels, y);
 }
 
 static void gsf__amt_resize_row(void* arg, size_t row, int32_t worker) {
@@ -16386,16 +16790,13 @@ static void gsf__amt_resize_row(void* arg, size_t row, int32_t worker) {
     const gsf__between v = gsf__look_between(((double)row + 0.5) * job->scale - 0.5, job->x->height);
     (void)worker;
     for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch)
-        gsf__map_sample(job->x, v, gsf__look_between(((double)i + 0.5) * job->scale - 0.5, job->x->width), job->by,
-                        job->y->channels, y);
+        gsf__map_sample(job->kernels, job->x, v, gsf__look_between(((double)i + 0.5) * job->scale - 0.5, job->x->width),
+                        job->by, job->y->channels, y);
 }
 
 // y = by * x resized bilinearly, without antialiasing, as PyTorch does it (align_corners=False); one image
 static void gsf__amt_resize(gsf__amt* net, const gsf__map* x, double scale, double by, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     job.scale = 1.0 / scale;
     job.by = (float)by;
     gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_resize_row, &job);
@@ -16407,57 +16808,62 @@ static void gsf__amt_warp_row(void* arg, size_t row, int32_t worker) { // x2: th
     float* y = gsf__map_row(job->y, row);
     (void)worker;
     for (int64_t i = 0; i < job->y->width; i++, y += job->y->pitch, flow += job->x2->pitch)
-        gsf__map_sample(job->x, gsf__look_between((double)row + (double)flow[1], job->x->height),
+        gsf__map_sample(job->kernels, job->x, gsf__look_between((double)row + (double)flow[1], job->x->height),
                         gsf__look_between((double)i + (double)flow[0], job->x->width), 1.0f, job->y->channels, y);
 }
 
 static void gsf__amt_warp(gsf__amt* net, const gsf__map* x, const gsf__map* flow, const gsf__map* y) {
-    gsf__amt_row_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
+    gsf__amt_row_job job = gsf__amt_begin(net, x, y);
     job.x2 = flow;
-    job.y = y;
     gsf__parallel_for(net->ctx, (size_t)y->height, gsf__amt_warp_row, &job);
 }
 
-static void gsf__amt_sum_channel(void* arg, size_t chunk, int32_t worker) { // mean and deviation of a channel of an image
+static void gsf__amt_moments_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
     const gsf__map* y = job->y;
-    const int64_t image = (int64_t)chunk / y->channels, pixels = y->height * y->width;
-    const float* from = y->data + image * pixels * y->pitch + (int64_t)chunk % y->channels;
-    double sum = 0.0, square = 0.0, *out = (double*)(uintptr_t)job->moments + 2 * chunk;
     (void)worker;
-    for (int64_t i = 0; i < pixels; i++) sum += (double)from[i * y->pitch];
-    const double mean = sum / (double)pixels;
-    for (int64_t i = 0; i < pixels; i++) square += ((double)from[i * y->pitch] - mean) * ((double)from[i * y->pitch] - mean);
-    out[0] = mean;
-    out[1] = 1.0 / sqrt(square / (double)pixels + 1e-5);
+    job->kernels->moments(gsf__map_row(y, row), y->width, y->channels, y->pitch,
+                          job->moments + (int64_t)row * 2 * gsf__round_up(y->channels, GSF__CONV_N));
 }
 
 static void gsf__amt_norm_row(void* arg, size_t row, int32_t worker) {
     const gsf__amt_row_job* job = (const gsf__amt_row_job*)arg;
-    const double* moments = job->moments + (int64_t)row / job->y->height * 2 * job->y->channels;
+    const int64_t image = (int64_t)row / job->y->height, c = job->y->channels;
     float* y = gsf__map_row(job->y, row);
     (void)worker;
     for (int64_t x = 0; x < job->y->width; x++, y += job->y->pitch)
-        for (int64_t c = 0; c < job->y->channels; c++) {
-            const float v = (float)(((double)y[c] - moments[2 * c]) * moments[2 * c + 1]);
-            y[c] = v < 0.0f ? v * job->leak : v;
-        }
+        job->kernels->scale(job->means + image * 2 * c, job->factors + image * c, job->leak, c, y);
+}
+
+// Mean and 1 / deviation of channel c of an image, from the sums of its rows.
+static void gsf__amt_norm_of(const gsf__map* y, const double* moments, int64_t c, float* means, float* factor) {
+    const double pixels = (double)y->height * (double)y->width;
+    double sum = 0.0, square = 0.0;
+    for (int64_t row = 0; row < y->height; row++, moments += 2 * gsf__round_up(y->channels, GSF__CONV_N)) {
+        sum += moments[2 * c];
+        square += moments[2 * c + 1];
+    }
+    const double mean = sum / pixels, variance = square / pixels - mean * mean;
+    means[c] = (float)mean;
+    means[y->channels + c] = (float)(mean - (double)means[c]);
+    *factor = (float)(1.0 / sqrt((variance < 0.0 ? 0.0 : variance) + 1e-5));
 }
 
 // Instance norm in place: each channel of each image gets mean 0 and deviation 1; then ReLU, if `rectify` is set.
 static gsf_result gsf__amt_norm(gsf__amt* net, int rectify, const gsf__map* y) {
-    const size_t count = (size_t)(y->images * y->channels);
-    double* moments = (double*)gsf_alloc(net->ctx, count, 2 * sizeof(double));
-    gsf__amt_row_job job;
+    const int64_t rows = y->images * y->height, c = y->channels, sums = 2 * gsf__round_up(c, GSF__CONV_N);
+    double* moments = (double*)gsf_alloc(net->ctx, (size_t)(rows * sums + 2 * y->images * c), sizeof(double));
+    gsf__amt_row_job job = gsf__amt_begin(net, NULL, y);
     if (!moments) return GSF_ERROR_OUT_OF_MEMORY;
-    memset(&job, 0, sizeof job);
-    job.y = y;
+    float *means = (float*)(void*)(moments + rows * sums), *factors = means + 2 * y->images * c;
     job.moments = moments;
+    job.means = means;
+    job.factors = factors;
     job.leak = rectify ? 0.0f : 1.0f;
-    gsf__parallel_for(net->ctx, count, gsf__amt_sum_channel, &job);
-    gsf__parallel_for(net->ctx, (size_t)(y->images * y->height), gsf__amt_norm_row, &job);
+    gsf__parallel_for(net->ctx, (size_t)rows, gsf__amt_moments_row, &job);
+    for (int64_t i = 0; i < y->images * c; i++)
+        gsf__amt_norm_of(y, moments + i / c * y->height * sums, i % c, means + i / c * 2 * c, factors + i);
+    gsf__parallel_for(net->ctx, (size_t)rows, gsf__amt_norm_row, &job);
     gsf_free(net->ctx, moments);
     return gsf__check_cancel(net->ctx);
 }
@@ -16470,41 +16876,50 @@ static gsf_result gsf__amt_convolve(gsf__amt* net, const gsf__amt_conv* layer, i
     const int64_t pad = layer->conv.weight->shape[2] / 2, over = 2 * pad - layer->conv.weight->shape[2];
     GSF__TRY(gsf__amt_make(net, x->images, (x->height + over) / stride + 1, (x->width + over) / stride + 1,
                            layer->conv.weight->shape[0], y));
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &layer->conv, stride, pad, 0, x, y));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &layer->conv, stride, pad, 0, x, y));
     return layer->slope ? gsf__amt_activate(net, layer->slope, 0.0f, y) : GSF_OK;
 }
 
 // The same in place or into an existing map, at stride 1; `leak` is the slope of a LeakyReLU, 1: none
 static gsf_result gsf__amt_convolve_to(gsf__amt* net, const gsf__nn_layer* layer, float leak, const gsf__map* x,
                                        const gsf__map* y) {
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, layer, 1, layer->weight->shape[2] / 2, 0, x, y));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, layer, 1, layer->weight->shape[2] / 2, 0, x, y));
     return leak != 1.0f ? gsf__amt_activate(net, NULL, leak, y) : GSF_OK;
+}
+
+// The weights (out, in, 2, 2) of the convolution that gives the pixels of one parity; w: scratch, (16 in out)
+static void gsf__amt_quarter(const gsf_nn_tensor* weight, int64_t py, int64_t px, float* w, float* quarter) {
+    const int64_t in = weight->shape[0], out = weight->shape[1];
+    gsf_nn_convert_tensor(weight, 0, 16 * in * out, w);
+    for (int64_t o = 0; o < out; o++)
+        for (int64_t i = 0; i < in; i++)
+            for (int64_t k = 0; k < 4; k++) // rows before and at the output's (parity 0), or at and after it
+                *quarter++ = w[(i * out + o) * 16 + (3 - py - 2 * (k / 2)) * 4 + (3 - px - 2 * (k % 2))];
 }
 
 // ConvTranspose2d(4, stride 2, padding 1): for each parity of the output's row and column a 2 x 2 convolution.
 static gsf_result gsf__amt_up(gsf__amt* net, const gsf__nn_layer* layer, const gsf__map* x, const gsf__map* y) {
     const int64_t in = layer->weight->shape[0], out = layer->weight->shape[1], shape[4] = {out, in, 2, 2};
-    float* parts = (float*)gsf_alloc(net->ctx, (size_t)(16 * in * out), 2 * sizeof(float));
-    gsf_result result = parts ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    if (!result) gsf_nn_convert_tensor(layer->weight, 0, 16 * in * out, parts + 16 * in * out);
+    gsf_result result = GSF_OK;
     for (int64_t parity = 0; parity < 4 && !result; parity++) {
         const int64_t py = parity / 2, px = parity % 2;
-        float* w = parts + parity * 4 * in * out;
-        for (int64_t o = 0; o < out; o++)
-            for (int64_t i = 0; i < in; i++)
-                for (int64_t k = 0; k < 4; k++) // rows before and at the output's (parity 0), or at and after it
-                    w[(o * in + i) * 4 + k] = parts[16 * in * out + (i * out + o) * 16 + (3 - py - 2 * (k / 2)) * 4 +
-                                                    (3 - px - 2 * (k % 2))];
+        const char* key = (const char*)layer->weight->data + parity; // each has an address in the tensor for itself
+        float* w = NULL;
+        if (!gsf__map_find_packed(&net->layers, key)) {
+            w = (float*)gsf_alloc(net->ctx, (size_t)(in * out), 20 * sizeof(float));
+            if (!w) return GSF_ERROR_OUT_OF_MEMORY;
+            gsf__amt_quarter(layer->weight, py, px, w + 4 * in * out, w);
+        }
         const gsf_nn_tensor weight = gsf_nn_wrap_tensor(layer->weight->name, w, 4, shape);
         const gsf__nn_layer quarter = {&weight, layer->bias};
         gsf__map part = *y;
         part.data += (py * y->width + px) * y->pitch;
         part.height = x->height;
         part.width = x->width;
-        const gsf__map_conv c = {&quarter, 1, 1, 0, 1 - py, px, 2 * y->pitch, 2 * y->width * y->pitch};
-        result = gsf__map_convolve_at(net->ctx, &net->conv, &c, x, &part);
+        const gsf__map_conv c = {&quarter, 1, 1, 0, 1 - py, px, 2 * y->pitch, 2 * y->width * y->pitch, key};
+        result = gsf__map_convolve_at(net->ctx, &net->layers, &c, x, &part);
+        gsf_free(net->ctx, w);
     }
-    gsf_free(net->ctx, parts);
     return result ? result : gsf__check_cancel(net->ctx);
 }
 
@@ -16538,11 +16953,11 @@ static gsf_result gsf__amt_decode(gsf__amt* net, const gsf__amt_decoder* d, cons
             b = c;
             continue;
         }
-        GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[i].conv, 1, 1, 0, &part, &part));
+        GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &d->convs[i].conv, 1, 1, 0, &part, &part));
         GSF__TRY(gsf__amt_activate(net, d->convs[i].slope, 0.0f, &part));
     }
     GSF__TRY(gsf__amt_make(net, 1, b.height, b.width, b.channels, &c));
-    GSF__TRY(gsf__map_convolve(net->ctx, &net->conv, &d->convs[4].conv, 1, 1, 0, &b, &c));
+    GSF__TRY(gsf__map_convolve(net->ctx, &net->layers, &d->convs[4].conv, 1, 1, 0, &b, &c));
     gsf__amt_add(net, &a, &c);
     GSF__TRY(gsf__amt_activate(net, d->convs[4].slope, 0.0f, &c));
     return gsf__amt_up(net, &d->up, &c, y);
@@ -16551,19 +16966,11 @@ static gsf_result gsf__amt_decode(gsf__amt* net, const gsf__amt_decoder* d, cons
 // ---- AMT-S: correlation
 
 typedef struct gsf__amt_lookup_job {
+    const gsf__map_kernels* kernels;
     const gsf__map* from;                    // features of one image, 1/8
     const gsf__map* pyramid;                 // (levels) of the other's
     const gsf__map *flow, *out;              // (flow: 2 channels, in 1/8 pixels; out: levels * 49)
 } gsf__amt_lookup_job;
-
-static float gsf__amt_dot(const float* a, const float* b, int64_t count) {
-    float sums[8] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8)
-        for (int k = 0; k < 8; k++) sums[k] += a[i + k] * b[i + k];
-    for (; i < count; i++) sums[i & 7] += a[i] * b[i];
-    return ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
-}
 
 static void gsf__amt_lookup_row(void* arg, size_t row, int32_t worker) {
     enum { SIDE = GSF__AMT_WINDOW + 1 };
@@ -16583,12 +16990,12 @@ static void gsf__amt_lookup_row(void* arg, size_t row, int32_t worker) {
             if (!(fabs(v) < 1e6)) v = 1e6;
             const int64_t u0 = (int64_t)floor(u) - GSF__AMT_RADIUS, v0 = (int64_t)floor(v) - GSF__AMT_RADIUS;
             const float du = (float)(u - floor(u)), dv = (float)(v - floor(v));
-            for (int64_t j = 0; j < SIDE; j++)
-                for (int64_t i = 0; i < SIDE; i++) {
-                    const int inside = u0 + i >= 0 && u0 + i < to->width && v0 + j >= 0 && v0 + j < to->height;
-                    const float* at = inside ? to->data + ((v0 + j) * to->width + u0 + i) * to->pitch : NULL;
-                    products[j][i] = at ? scale * gsf__amt_dot(from, at, channels) : 0.0f;
-                }
+            const int64_t first = u0 < 0 ? -u0 : 0, last = gsf__least(SIDE, to->width - u0); // those inside
+            memset(products, 0, sizeof products);
+            for (int64_t j = 0; j < SIDE && first < last; j++)
+                if (v0 + j >= 0 && v0 + j < to->height)
+                    job->kernels->products(from, to->data + ((v0 + j) * to->width + u0 + first) * to->pitch, last - first,
+                                           to->pitch, channels, scale, products[j] + first);
             float* window = out + level * GSF__AMT_WINDOW * GSF__AMT_WINDOW;
             for (int64_t i = 0; i < GSF__AMT_WINDOW; i++) // the offset in x varies slowest
                 for (int64_t j = 0; j < GSF__AMT_WINDOW; j++) {
@@ -16612,10 +17019,7 @@ static void gsf__amt_pool_row(void* arg, size_t row, int32_t worker) { // means 
 static gsf_result gsf__amt_make_pyramid(gsf__amt* net, const gsf__map* features, gsf__map* pyramid) {
     pyramid[0] = *features;
     for (int i = 1; i < GSF__AMT_LEVELS; i++) {
-        gsf__amt_row_job job;
-        memset(&job, 0, sizeof job);
-        job.x = &pyramid[i - 1];
-        job.y = &pyramid[i];
+        gsf__amt_row_job job = gsf__amt_begin(net, &pyramid[i - 1], &pyramid[i]);
         GSF__TRY(gsf__amt_make(net, 1, job.x->height / 2, job.x->width / 2, job.x->channels, &pyramid[i]));
         gsf__parallel_for(net->ctx, (size_t)pyramid[i].height, gsf__amt_pool_row, &job);
     }
@@ -16679,7 +17083,8 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
     for (int i = 0; i < 2; i++) { // the middle's flow to the second image, doubled, leads from the first to it
         const gsf__map way = gsf__map_slice(&flow, 2 * !i, 2);
         const gsf__map out = gsf__map_slice(&corr, i * GSF__AMT_LOOKUP, GSF__AMT_LOOKUP);
-        gsf__amt_lookup_job job = {&pair->pyramids[i][0], pair->pyramids[!i], &way, &out};
+        gsf__amt_lookup_job job = {gsf__map_kernels_of(net->ctx->cpu_level), &pair->pyramids[i][0], pair->pyramids[!i], &way,
+                                   &out};
         gsf__parallel_for(net->ctx, (size_t)high, gsf__amt_lookup_row, &job);
     }
     gsf__amt_reveal(net, "update.in_flow", scale, &flow);
@@ -16758,6 +17163,7 @@ static gsf_result gsf__amt_refine(gsf__amt* net, int scale, const gsf__amt_pair*
 }
 
 typedef struct gsf__amt_merge_job {
+    const gsf__map_kernels* kernels;
     const gsf__map *images, *decoded, *candidates;
     double mean;
 } gsf__amt_merge_job;
@@ -16775,7 +17181,7 @@ static void gsf__amt_merge_row(void* arg, size_t row, int32_t worker) {
             const double mask = 1.0 / (1.0 + exp(-(double)d[4 * GSF__AMT_FLOWS + k]));
             for (int i = 0; i < 2; i++) {
                 const float* flow = d + 2 * (i * GSF__AMT_FLOWS + k);
-                gsf__map_sample(&image[i], gsf__look_between((double)row + (double)flow[1], image[i].height),
+                gsf__map_sample(job->kernels, &image[i], gsf__look_between((double)row + (double)flow[1], image[i].height),
                                 gsf__look_between((double)x + (double)flow[0], image[i].width), 1.0f, 3, warped[i]);
             }
             for (int c = 0; c < 3; c++)
@@ -16793,7 +17199,7 @@ static gsf_result gsf__amt_interpolate(gsf__amt* net, gsf__amt_pair* pair, gsf__
         if (scale > 0) GSF__TRY(gsf__amt_update_run(net, scale, pair, &finer));
     }
     GSF__TRY(gsf__amt_make(net, 1, pair->images.height, pair->images.width, 3 * GSF__AMT_FLOWS, &candidates));
-    gsf__amt_merge_job job = {&pair->images, &decoded, &candidates, pair->mean};
+    gsf__amt_merge_job job = {gsf__map_kernels_of(net->ctx->cpu_level), &pair->images, &decoded, &candidates, pair->mean};
     gsf__parallel_for(net->ctx, (size_t)candidates.height, gsf__amt_merge_row, &job);
     GSF__TRY(gsf__amt_convolve(net, &net->merge[0], 1, &candidates, &hidden));
     GSF__TRY(gsf__amt_convolve(net, &net->merge[1], 1, &hidden, out));
@@ -16953,7 +17359,7 @@ static gsf_result gsf__amt_open(gsf_context* ctx, const gsf_nn_metric* metric, v
 static void gsf__amt_close(gsf_context* ctx, void* state) {
     gsf__amt* net = (gsf__amt*)state;
     for (int i = 0; i < GSF__AMT_ROOMS; i++) gsf__nn_destroy_workspace(ctx, &net->rooms[i]);
-    gsf__nn_destroy_workspace(ctx, &net->conv);
+    gsf__destroy_map_layers(ctx, &net->layers);
     gsf_destroy_image(ctx, &net->even);
     gsf_destroy_image(ctx, &net->odd);
     gsf_destroy_image(ctx, &net->middle);

@@ -2,6 +2,7 @@
 // By hand: cc -O2 -fopenmp -I. bench/bench_metrics.c -o bench_metrics -lm
 //
 //     bench_metrics [--json] [--quick] [--filter TEXT] [--threads N] [--frames N] [--models FOLDER]
+//     bench_metrics --make FOLDER     only writes the weights, of networks an eighth as wide or less (for tests)
 //
 // A row is the whole clip: 49 frames, or N; with --quick 2 (motion smoothness: 3), and without the networks that take long. The
 // weights are written to FOLDER (default: bench_metrics.models in the current folder) where they are missing, 1.3 GB for all of
@@ -20,7 +21,7 @@ enum { WIDTH = 720, HEIGHT = 480, TENSORS = 400 };
 
 typedef struct bench_options {
     int json, quick, threads, frames;
-    const char *filter, *models;
+    const char *filter, *models, *make;
 } bench_options;
 
 // ---- random weights -------------------------------------------------------------------
@@ -31,6 +32,7 @@ typedef struct bench_file { // tensors of a file
     char names[TENSORS][96];
     size_t count;
     uint64_t seed;
+    int small; // instead of the published widths and depths
 } bench_file;
 
 // Adds a tensor of the shape given by up to four sizes, 0: none. Uniform, and such that a layer keeps the scale of its input.
@@ -45,8 +47,11 @@ static void add_tensor(bench_file* file, const char* name, int64_t a, int64_t b,
     float* data = (float*)bench_alloc(file->ctx, (size_t)count, sizeof(float));
     const double most = rank == 1 ? 0.1 : sqrt(3.0 / (double)fan);
     const int is_scale = strstr(name, "norm") && strstr(name, "weight"); // of a norm
-    for (int64_t i = 0; i < count; i++)
-        data[i] = (float)((is_scale ? 1.0 : 0.0) + most * (2.0 * gsf_draw_uniform(file->seed, file->count, (uint64_t)i) - 1.0));
+    const int is_head = strncmp(name, "lin", 3) == 0;                    // of LPIPS, where no weight is negative
+    for (int64_t i = 0; i < count; i++) {
+        const double x = most * (2.0 * gsf_draw_uniform(file->seed, file->count, (uint64_t)i) - 1.0);
+        data[i] = (float)(is_scale ? 1.0 + x : is_head ? fabs(x) : x);
+    }
     snprintf(file->names[file->count], sizeof file->names[0], "%s", name);
     file->tensors[file->count] = gsf_nn_wrap_tensor(file->names[file->count], data, rank, shape);
     file->count++;
@@ -76,7 +81,7 @@ static void make_lpips(bench_file* file, const char* folder, int kind) {
     char name[96];
     for (int i = 0; gsf__lpips_nets[kind].steps[i].form; i++) {
         const gsf__lpips_step* s = &gsf__lpips_nets[kind].steps[i];
-        const int64_t out = outputs[kind][i];
+        const int64_t out = outputs[kind][i] / (file->small ? 8 : 1);
         snprintf(name, sizeof name, "features.%d", s->index);
         if (s->form == GSF__LPIPS_CONV) add_layer(file, name, out, channels, s->kernel);
         if (s->form == GSF__LPIPS_FIRE) { // squeezes to an eighth of what it returns
@@ -98,40 +103,44 @@ static void make_lpips(bench_file* file, const char* folder, int kind) {
     save_file(file, folder, gsf__lpips_nets[kind].heads);
 }
 
-static void make_tower(bench_file* file, const char* folder, const gsf__tower_form* form) { // ViT-B/16
-    enum { D = 768 };
+static int64_t tower_width(const bench_file* file) { return file->small ? 64 : 768; } // ViT-B/16
+static int tower_layers(const bench_file* file) { return file->small ? 2 : 12; }
+
+static void make_tower(bench_file* file, const char* folder, const gsf__tower_form* form) {
+    const int64_t d = tower_width(file);
     char name[96];
-    add_tensor(file, "cls_token", 1, 1, D, 0);
-    add_tensor(file, "pos_embed", 1, 197, D, 0);
-    add_layer(file, "patch_embed.proj", D, 3, 16);
-    for (int i = 0; i < 12; i++) {
-        static const struct { const char* name; int64_t out, in; } layers[] = {
-            {"norm1", D, 0}, {"norm2", D, 0}, {"attn.qkv", 3 * D, D}, {"attn.proj", D, D}, {"mlp.fc1", 4 * D, D},
-            {"mlp.fc2", D, 4 * D}};
+    add_tensor(file, "cls_token", 1, 1, d, 0);
+    add_tensor(file, "pos_embed", 1, 197, d, 0);
+    add_layer(file, "patch_embed.proj", d, 3, 16);
+    for (int i = 0; i < tower_layers(file); i++) {
+        const struct { const char* name; int64_t out, in; } layers[] = {
+            {"norm1", d, 0}, {"norm2", d, 0}, {"attn.qkv", 3 * d, d}, {"attn.proj", d, d}, {"mlp.fc1", 4 * d, d},
+            {"mlp.fc2", d, 4 * d}};
         for (size_t k = 0; k < GSF__COUNT(layers); k++) {
             snprintf(name, sizeof name, "blocks.%d.%s", i, layers[k].name);
             add_layer(file, name, layers[k].out, layers[k].in, 0);
         }
     }
-    add_layer(file, "norm", D, 0, 0);
+    add_layer(file, "norm", d, 0, 0);
     if (form->clip) {
-        add_layer(file, "pos_drop", D, 0, 0);
-        add_tensor(file, "proj", D, 512, 0, 0);
+        add_layer(file, "pos_drop", d, 0, 0);
+        add_tensor(file, "proj", d, d * 2 / 3, 0, 0);
     }
     save_file(file, folder, form->file);
 }
 
 static void make_adapter(bench_file* file, const char* folder) { // LoRA of rank 16
+    const int64_t d = tower_width(file);
     char path[1200], name[96];
     static const char config[] = "{\"r\": 16, \"lora_alpha\": 8}";
     snprintf(path, sizeof path, "%s/ensemble_lora", folder);
     (void)mkdir(path, 0777);
     for (int tower = 0; tower < 3; tower++)
-        for (int i = 0; i < 12; i++)
+        for (int i = 0; i < tower_layers(file); i++)
             for (int up = 0; up < 2; up++) {
                 snprintf(name, sizeof name, "base_model.model.extractor_list.%d.model.blocks.%d.attn.qkv.lora_%c.weight", tower,
                          i, up ? 'B' : 'A');
-                add_tensor(file, name, up ? 2304 : 16, up ? 16 : 768, 0, 0);
+                add_tensor(file, name, up ? 3 * d : 16, up ? 16 : d, 0, 0);
             }
     save_file(file, path, "adapter_model");
     snprintf(path, sizeof path, "%s/ensemble_lora/adapter_config.json", folder);
@@ -139,9 +148,10 @@ static void make_adapter(bench_file* file, const char* folder) { // LoRA of rank
 }
 
 static void make_amt(bench_file* file, const char* folder) { // AMT-S
-    static const int64_t pyramid[5] = {3, 20, 32, 44, 56}, widths[4] = {32, 32, 64, 96};
+    const int64_t q = file->small ? 4 : 1, pyramid[5] = {3, 20 / q, 32 / q, 44 / q, 56 / q};
+    const int64_t widths[4] = {32 / q, 32 / q, 64 / q, 96 / q};
     char name[96];
-    add_layer(file, "feat_encoder.conv1", 32, 3, 7);
+    add_layer(file, "feat_encoder.conv1", widths[0], 3, 7);
     for (int i = 0; i < 6; i++) {
         const int64_t out = widths[i / 2 + 1], in = i % 2 ? out : widths[i / 2];
         for (int k = 0; k < 3; k++) {
@@ -152,7 +162,7 @@ static void make_amt(bench_file* file, const char* folder) { // AMT-S
         snprintf(name, sizeof name, "feat_encoder.layer%d.0.downsample.0", i / 2 + 1);
         add_layer(file, name, out, in, 1);
     }
-    add_layer(file, "feat_encoder.conv2", 84, 96, 1);
+    add_layer(file, "feat_encoder.conv2", 84 / q, widths[3], 1);
     for (int i = 0; i < 4; i++) {
         const int64_t c = pyramid[i + 1], wide = i == 3 ? 2 * c : 3 * c, in = i == 3 ? wide + 1 : wide + 4;
         for (int k = 0; k < 2; k++) {
@@ -166,7 +176,7 @@ static void make_amt(bench_file* file, const char* folder) { // AMT-S
         snprintf(name, sizeof name, "decoder%d.convblock.0.1.weight", i + 1);
         add_tensor(file, name, wide, 0, 0, 0);
         for (int k = 1; k <= 5; k++) {
-            const int64_t side = k == 2 || k == 4 ? 20 : wide; // the last 20 channels only
+            const int64_t side = k == 2 || k == 4 ? 20 / q : wide; // the last 20 channels only
             snprintf(name, sizeof name, k < 5 ? "decoder%d.convblock.1.conv%d.0" : "decoder%d.convblock.1.conv%d", i + 1, k);
             add_layer(file, name, side, side, 3);
             snprintf(name, sizeof name, k < 5 ? "decoder%d.convblock.1.conv%d.1.weight" : "decoder%d.convblock.1.prelu.weight",
@@ -180,9 +190,9 @@ static void make_amt(bench_file* file, const char* folder) { // AMT-S
         add_tensor(file, name, up, 0, 0, 0);
         const int64_t f = pyramid[i];
         const struct { const char* name; int64_t out, in, kernel; } update[] = {
-            {"convc1", 64, 392, 1}, {"convf1", 40, 4, 7}, {"convf2", 20, 40, 3}, {"conv", 68, 84, 3}, {"gru.0", 76, 72 + f, 3},
-            {"gru.2", 76, 76, 3}, {"feat_head.0", 76, 76, 3}, {"feat_head.2", f, 76, 3}, {"flow_head.0", 76, 76, 3},
-            {"flow_head.2", 4, 76, 3}};
+            {"convc1", 64 / q, 392, 1}, {"convf1", 40 / q, 4, 7}, {"convf2", 20 / q, 40 / q, 3}, {"conv", 68 / q, 84 / q, 3},
+            {"gru.0", 76 / q, 68 / q + 4 + f, 3}, {"gru.2", 76 / q, 76 / q, 3}, {"feat_head.0", 76 / q, 76 / q, 3},
+            {"feat_head.2", f, 76 / q, 3}, {"flow_head.0", 76 / q, 76 / q, 3}, {"flow_head.2", 4, 76 / q, 3}};
         for (size_t k = 0; i && k < GSF__COUNT(update); k++) {
             snprintf(name, sizeof name, "update%d.%s", i + 1, update[k].name);
             add_layer(file, name, update[k].out, update[k].in, update[k].kernel);
@@ -201,10 +211,11 @@ static int has_file(const char* folder, const char* name) {
     return stat(path, &s) == 0;
 }
 
-static void make_weights(gsf_context* ctx, const char* folder, int kind) {
+static void make_weights(gsf_context* ctx, const char* folder, int kind, int small) {
     static bench_file file;
     char name[96];
     file.ctx = ctx;
+    file.small = small;
     file.count = 0;
     file.seed = (uint64_t)kind;
     (void)mkdir(folder, 0777);
@@ -265,7 +276,7 @@ static void bench_one(const bench_options* o, int threads, const char* metric_na
     (void)bench_context(&ctx, GSF_CPU_AUTO, threads);
     memset(&metric, 0, sizeof metric);
     if (kind >= 0) {
-        make_weights(&ctx, o->models, kind);
+        make_weights(&ctx, o->models, kind, 0);
         metric.kind = (gsf_nn_metric_kind)kind;
         metric.models = o->models;
     }
@@ -313,11 +324,19 @@ int main(int argc, char** argv) {
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--frames") == 0) o.frames = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--models") == 0) o.models = argv[++i];
+        else if (value && strcmp(argv[i], "--make") == 0) o.make = argv[++i];
         else {
             fprintf(stderr, "usage: bench_metrics [--json] [--quick] [--filter TEXT] [--threads N] [--frames N] "
-                            "[--models FOLDER]\n");
+                            "[--models FOLDER | --make FOLDER]\n");
             return 2;
         }
+    }
+    if (o.make) {
+        gsf_context ctx;
+        (void)bench_context(&ctx, GSF_CPU_AUTO, 1);
+        for (size_t i = 0; i < sizeof cases / sizeof *cases; i++)
+            if (cases[i].kind >= 0) make_weights(&ctx, o.make, cases[i].kind, 1);
+        return 0;
     }
     for (int threads = 1; threads <= 2; threads++)
         for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) bench_one(&o, threads, cases[i].name, cases[i].kind);

@@ -8,10 +8,11 @@ of threads, frame by frame on frames of the same size. That row has the package 
 ours; above 1 we are faster) and "cpu_ratio" (the same for CPU seconds, for machines that are not idle). The packages:
 scikit-image, torchmetrics, pytorch-msssim, lpips, and PyTorch for what GSFixer's loss_utils.py does (ssim_3dgs). I2V has
 torchvision's ViT-B/16 in the place of DINO and of DreamSim's three networks: the same architecture, without CLIP's norm and
-projection. Weights are random. Preparing frames is timed on both sides.
+projection. Motion smoothness has peer_amt.py: AMT is published as a repository. Weights are random. Preparing frames is timed
+on both sides.
 
-Needs PyTorch, torchvision, numpy, scikit-image, torchmetrics, pytorch-msssim and lpips. Cases without a package are skipped;
-motion smoothness has none (AMT is published as a repository).
+Needs PyTorch, torchvision, numpy, safetensors, scikit-image, torchmetrics, pytorch-msssim and lpips; cases whose package is
+missing are skipped.
 """
 import argparse
 import json
@@ -62,7 +63,7 @@ def vit(count, side):
     return run
 
 
-def packages(name):
+def packages(name, models):
     """(package, function of two frames) for a case."""
     if name == "psnr":
         import skimage.metrics
@@ -92,6 +93,14 @@ def packages(name):
         yield "torchvision", vit(1, 256)
     elif name == "i2v_background":
         yield "torchvision", vit(3, (224, 224))
+    elif name == "motion_smoothness":
+        import peer_amt
+        net = peer_amt.Amt(os.path.join(models, "amt-s.safetensors"))
+
+        def between(a, b):  # the middle frame in 8 bits, and its distance from a frame
+            middle = (255 * net.interpolate(tensor(a), tensor(b))[0]).byte().permute(1, 2, 0).numpy()
+            return np.abs(middle.astype(np.int16) - a).mean()
+        yield "PyTorch", between
 
 
 def frames_of(height, width):
@@ -100,10 +109,10 @@ def frames_of(height, width):
     return base, (base + generator.integers(0, 30, base.shape, dtype=np.uint8)).astype(np.uint8)
 
 
-def measure(function, a, b, frames):
+def measure(function, a, b, calls):
     function(a, b)
     start, cpu = time.perf_counter(), time.process_time()
-    for _ in range(frames):
+    for _ in range(calls):
         function(a, b)
     return time.perf_counter() - start, time.process_time() - cpu
 
@@ -130,8 +139,9 @@ def main():
         a, b = frames_of(int(height), int(width))
         try:
             with torch.inference_mode():
-                for package, function in packages(name):
-                    seconds, cpu = measure(function, a, b, int(frames))
+                for package, function in packages(name, options.models or "bench_metrics.models"):
+                    calls = (int(frames) - 1) // 2 if name == "motion_smoothness" else int(frames)  # every other frame
+                    seconds, cpu = measure(function, a, b, calls)
                     theirs = {key: row[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
                     theirs.update(variant=package, seconds=seconds, cpu_seconds=cpu, rate=row["work"] / seconds,
                                   reference="none", ratio=round(seconds / row["seconds"], 3),

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Turns the output of bench_splat --json and bench_nn --json into tables and charts.
+"""Turns the output of bench_splat --json, bench_nn --json and bench_metrics --json into tables and charts.
 
     bench/results.py ROWS.jsonl DIR
 
 Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a training step, by size), DIR/growth.svg
 (how run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows
 with the same case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of
-test_stress --json go to the table of worst errors, rows of peers_nn.py with a peer as variant to the ratios. Needs only
-the standard library.
+test_stress --json go to the table of worst errors, rows of peers_nn.py and peers_metrics.py with a peer as variant to the
+ratios, errors that the golden tests note (GSF_TEST_ERRORS) to the table of the metrics. Needs only the standard library.
 """
 import collections
 import csv
@@ -386,13 +386,39 @@ def nn_sections(lines, rows, has_pipeline):
                 percent(r, "peak_share"), "%.2f GiB" % (r["peak_rss_bytes"] / 2**30)] for r in models])
 
 
-def write_markdown(path, rows, stress, has_growth, has_pipeline):
+def metric_sections(lines, rows, noted):
+    worst = {}
+    for row in noted:
+        worst[row["error_of"]] = max(row["error"], worst.get(row["error_of"], 0.0))
+    peers = {(r["case"], r["threads"]): r for r in rows if "ratio" in r}
+    lines += ["## Metrics: run time and error", "",
+              "A clip of 720 x 480 with as many frames as N says, frame by frame; networks at their real sizes with random "
+              "weights, which are read before. Errors are the largest against double precision in `golden_metrics` and "
+              "`golden_metricnets`: relative for LPIPS, in decibels for PSNR, of the score (0 to 1) for all others. The peer's "
+              "time divided by ours, with its CPU time divided by ours in brackets, is that of the same run "
+              "(`bench/peers_metrics.py` says what runs as a peer of each). Memory is the peak of the process so far.", ""]
+    body = []
+    for r in rows:
+        if "ratio" in r:
+            continue
+        name, _, frames = r["case"].partition(" 720x480 ")
+        peer = peers.get((r["case"], r["threads"]))
+        body.append([name, frames, r["isa"], str(r["threads"]), short(r["seconds"]), short(r["cpu_seconds"]),
+                     "%.0f MiB" % (r["peak_rss_bytes"] / 2**20), "%.1e" % worst[name] if name in worst else "",
+                     "%.2f (%.2f) %s" % (peer["ratio"], peer["cpu_ratio"], peer["variant"]) if peer else ""])
+    table(lines, ["", "frames", "instructions", "threads", "seconds", "CPU seconds", "peak memory", "largest error",
+                  "peer / ours"], body)
+
+
+def write_markdown(path, rows, stress, noted, has_growth, has_pipeline):
     lines = ["# Speed and error", "",
              "Version %s, measured by `bench/run.sh` on %s. The machine may have run other work at the same time: compare rows "
              "within one run, not between runs." % (version(), machine()), ""]
-    splat_sections(lines, [r for r in rows if r["bench"] != "nn"], stress, has_growth)
+    splat_sections(lines, [r for r in rows if r["bench"] not in ("nn", "metrics")], stress, has_growth)
     if any(r["bench"] == "nn" for r in rows):
         nn_sections(lines, [r for r in rows if r["bench"] == "nn"], has_pipeline)
+    if any(r["bench"] == "metrics" for r in rows):
+        metric_sections(lines, [r for r in rows if r["bench"] == "metrics"], noted)
     with open(path, "w") as file:
         file.write("\n".join(lines).rstrip() + "\n")
 
@@ -409,8 +435,8 @@ def main():
     write_stages(os.path.join(sys.argv[2], "stages.svg"), rows)
     has_growth = write_growth(os.path.join(sys.argv[2], "growth.svg"), rows)
     has_pipeline = write_pipeline(os.path.join(sys.argv[2], "pipeline.svg"), rows)
-    write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows, [row for row in all_rows if "test" in row], has_growth,
-                   has_pipeline)
+    write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows, [row for row in all_rows if "test" in row],
+                   [row for row in all_rows if "error_of" in row], has_growth, has_pipeline)
     above = ["%s, %s, %s, %d threads: %.0f %% of the %s" % (r["case"], r["variant"], r["isa"], r["threads"], 100.0 * r[key], what)
              for r in rows for key, what in (("peak_share", "peak"), ("bandwidth_share", "bandwidth")) if r.get(key, 0.0) > 1.02]
     if above:

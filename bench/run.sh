@@ -5,9 +5,10 @@
 #   START=PLY                   these splats instead of the scene's points as the start
 #   OPENSPLAT=/path/opensplat   the same steps with OpenSplat, alternating with ours, and the ratio (needs SCENE)
 #   ROUNDS=5 STEPS=200          rounds and steps of that comparison
-#   TORCH=python3               the network kernels of the peers that this Python provides, and the ratios (peers_nn.py)
+#   TORCH=python3               the peers that this Python provides, and the ratios: network kernels (peers_nn.py), metrics
+#                               (peers_metrics.py)
 #   MODEL=FOLDER                one forward pass of this model, about 90 minutes (make_model --size full --parts transformer,vae)
-# Without MODEL it takes about an hour with all peers and forty minutes without peers; --quick takes about two minutes. The
+# Without MODEL it takes about 80 minutes with all peers and fifty minutes without peers; --quick takes about two minutes. The
 # machine should be otherwise idle.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -18,7 +19,8 @@ export OMP_WAIT_POLICY=passive # spinning workers would take CPU time from each 
 
 cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
 rm -f "$build.cmake.log"
-cmake --build "$build" -j "$(nproc)" --target bench_splat bench_nn make_model test_stress > /dev/null
+cmake --build "$build" -j "$(nproc)" --target bench_splat bench_nn bench_metrics make_model test_stress \
+    golden_metrics golden_metricnets > /dev/null
 temporary=$(mktemp -d)
 trap 'rm -rf "$temporary"' EXIT
 rows=$temporary/rows
@@ -39,6 +41,16 @@ if [ -n "${TORCH:-}" ]; then
 else
     "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
 fi
+metrics=("$build/bench_metrics" --models "$temporary/metrics" ${quick[@]+"${quick[@]}"}) # 1.3 GB of weights
+if [ -n "${TORCH:-}" ]; then
+    "$TORCH" bench/peers_metrics.py "${metrics[@]}" | tee -a "$rows"
+else
+    "${metrics[@]}" --json | tee -a "$rows"
+fi
+rm -rf "$temporary/metrics"
+for golden in golden_metrics golden_metricnets; do # their errors against double precision
+    GSF_TEST_ERRORS=$rows "$build/tests/$golden" > /dev/null
+done
 for dtype in f32 bf16; do
     "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
         --parts transformer,vae,scheduler,features > /dev/null

@@ -226,7 +226,7 @@ static const command_spec command_specs[] = {
      run_filter},
     {"path", "SCENE --out PATH.json", "sample a camera path through a scene", 1, run_path},
     {"restore", "FRAMES_DIR --restorer ... --out DIR", "repair one clip of frames", 1, run_restore},
-    {"metrics", "DIR_A DIR_B", "compare images of the same name", 2, run_metrics},
+    {"metrics", "DIR_A [DIR_B]", "compare images of the same name, or measure one folder as a clip", -1, run_metrics},
     {"masks", "SCENE --model ALL.ply --out DIR", "write, for each held-out view, the pixels that some training view sees",
      1, run_masks},
     {"dataset", "SCENE... --out DIR", "write paired sequences of artifact and clean frames, to train and judge restorers", -1,
@@ -1080,9 +1080,10 @@ static int run_path(gsfix_app* app) {
 typedef struct metric_spec {
     const char* name;
     int net;      // a gsf_nn_metric_kind, or PIXELS of a gsf_metric
-    int raw, clip; // for LPIPS; measures DIR_A as a clip
+    int raw, clip; // for LPIPS; measures DIR_A as a clip, CLIP_ALONE: without DIR_B
 } metric_spec;
 
+enum { CLIP_ALONE = 2 };
 #define PIXELS(metric) (-1 - (int)GSF_METRIC_##metric) // and back: (gsf_metric)(-1 - net)
 static const metric_spec metric_specs[] = {
     {"psnr", PIXELS(PSNR), 0, 0},
@@ -1099,9 +1100,9 @@ static const metric_spec metric_specs[] = {
     {"lpips_squeeze_raw", GSF_NN_METRIC_LPIPS_SQUEEZE, 1, 0},
     {"i2v_subject", GSF_NN_METRIC_I2V_SUBJECT, 0, 1},
     {"i2v_background", GSF_NN_METRIC_I2V_BACKGROUND, 0, 1},
-    {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS, 0, 1},
-    {"overall_consistency", GSF_NN_METRIC_OVERALL_CONSISTENCY, 0, 1},
-    {"temporal_flickering", PIXELS(DIFFERENCE), 0, 1},
+    {"motion_smoothness", GSF_NN_METRIC_MOTION_SMOOTHNESS, 0, CLIP_ALONE},
+    {"overall_consistency", GSF_NN_METRIC_OVERALL_CONSISTENCY, 0, CLIP_ALONE},
+    {"temporal_flickering", PIXELS(DIFFERENCE), 0, CLIP_ALONE},
 };
 enum { METRIC_COUNT = sizeof metric_specs / sizeof *metric_specs };
 
@@ -1229,8 +1230,8 @@ static size_t least_frames(int net) {
     return net == GSF_NN_METRIC_MOTION_SMOOTHNESS ? 3 : net == GSF_NN_METRIC_OVERALL_CONSISTENCY ? 1 : 2;
 }
 
-// Passes the pictures of DIR_A, in the order of their names, to what measures clips, with DIR_B's first picture as the input
-// image. Two frames are held at a time.
+// Passes the pictures of DIR_A, in the order of their names, to what measures clips, with DIR_B's first picture, if there is a
+// DIR_B, as the input image. Two frames are held at a time.
 static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_names* left, const gsfix_names* right) {
     gsf_context* ctx = &app->ctx;
     int clips = 0;
@@ -1246,12 +1247,13 @@ static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_name
         clips = 1;
     }
     if (!clips) return GSF_OK;
-    if (!right->count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has no pictures", app->o.inputs[1]);
-    result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[1], right->names[0]).s, 3, &input);
+    if (right && !right->count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s has no pictures", app->o.inputs[1]);
+    if (right) result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[1], right->names[0]).s, 3, &input);
     for (size_t i = 0; i < left->count && result == GSF_OK; i++) {
         result = gsf_load_image(ctx, gsfix_pathf("%s/%s", app->o.inputs[0], left->names[i]).s, 3, &frame);
         for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++)
-            if (run->wanted[m] && metric_specs[m].clip) result = measure_frame(ctx, run, m, &before, &frame, &input);
+            if (run->wanted[m] && metric_specs[m].clip)
+                result = measure_frame(ctx, run, m, &before, &frame, right ? &input : NULL);
         gsf_destroy_image(ctx, &before);
         before = frame;
         memset(&frame, 0, sizeof frame);
@@ -1271,14 +1273,14 @@ static gsf_result measure_clip(gsfix_app* app, metric_run* run, const gsfix_name
 
 static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
     gsf_context* ctx = &app->ctx;
-    const char *a = app->o.inputs[0], *b = app->o.inputs[1];
+    const char *a = app->o.inputs[0], *b = app->o.input_count > 1 ? app->o.inputs[1] : NULL;
     gsfix_names left = {0}, right = {0};
     metric_sums total = {0};
     int by_pair = 0;
     gsf_result result = open_networks(app, run, app->o.prompt);
     for (int m = 0; m < METRIC_COUNT; m++) by_pair |= measures_pair(run, m, 0);
     if (result == GSF_OK) result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
-    if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
+    if (result == GSF_OK && b) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
     gsfix_json_begin(ctx, &app->json, "per_image", '[');
     for (size_t i = 0; i < left.count && result == GSF_OK && by_pair; i++) {
         const gsfix_path stem = gsfix_stem(left.names[i]);
@@ -1298,7 +1300,7 @@ static gsf_result compare_folders(gsfix_app* app, metric_run* run) {
         print_means(app, run, &total);
         if (unpaired) gsfix_note(app, "note: %zu pictures have no partner", unpaired);
     }
-    if (result == GSF_OK) result = measure_clip(app, run, &left, &right);
+    if (result == GSF_OK) result = measure_clip(app, run, &left, b ? &right : NULL);
     for (int m = 0; m < METRIC_COUNT; m++) gsf_nn_destroy_metric(ctx, &run->nets[m]);
     gsfix_free_names(ctx, &left);
     gsfix_free_names(ctx, &right);
@@ -1309,6 +1311,7 @@ static int run_metrics(gsfix_app* app) {
     metric_run run = {0};
     int nets = 0, prompts = 0;
     const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
+    if (app->o.input_count > 2) return gsfix_misused(app, "metrics: two folders at most");
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
@@ -1318,6 +1321,8 @@ static int run_metrics(gsfix_app* app) {
             return gsfix_misused(app, "%s needs --models", metric_specs[m].name);
         const int reads = metric_specs[m].net == GSF_NN_METRIC_OVERALL_CONSISTENCY;
         if (reads && !app->o.prompt) return gsfix_misused(app, "%s needs --prompt", metric_specs[m].name);
+        if (app->o.input_count < 2 && metric_specs[m].clip != CLIP_ALONE)
+            return gsfix_misused(app, "%s needs DIR_B", metric_specs[m].name);
         prompts += reads;
         run.wanted[m] = 1;
         nets += metric_specs[m].net >= 0;

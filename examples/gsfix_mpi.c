@@ -25,9 +25,10 @@
      itself. Workers that miss rank 0 in the same way exit;
    - a rank that was only slow does no harm: a task's folder is locked by the process at work in it, and the other one waits.
    Results do not depend on who does a task, so that the output is that of one process, byte for byte. If rank 0 or mpirun
-   dies, the same command with --resume goes on. */
+   dies, the same command with --resume goes on. Where a rank was lost, all others leave without MPI_Finalize, which may wait
+   for the lost one for ever; else they enter it together, when rank 0 has merged the folders. */
 enum { TAG_TO_WORKER = 1, TAG_TO_CHIEF = 2, TEXT_MOST = 400, BUSY_MOST = 600 };
-enum { ORDER_STOP = -1, ORDER_NONE = -2, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
+enum { ORDER_STOP = -1, ORDER_NONE = -2, ORDER_LEAVE = -3, NEWS_READY = 0, NEWS_ALIVE, NEWS_DONE, NEWS_FAILED, NEWS_KILLED };
 enum { START_MOST = 300, END_MOST = 10, MERGE_MOST = 3600 }; // seconds until all have started, for MPI to end, for merging
 static const double LOST_AFTER = 60.0, ALIVE_EVERY = 1.0, LOOK_EVERY = 0.5, ORDER_EVERY = 10.0;
 
@@ -39,8 +40,9 @@ typedef struct news { // from a worker
 } news;
 
 typedef struct order { // to a worker
-    int64_t task;       // or ORDER_STOP, or ORDER_NONE: says only that rank 0 lives
+    int64_t task;       // or ORDER_STOP: no more tasks; ORDER_LEAVE: all is merged; ORDER_NONE: says only that rank 0 lives
     int32_t again, pid; // again: a try after the first one
+    int32_t lost;       // of ORDER_LEAVE: a rank was lost
     char name[256], host[64];
 } order;
 
@@ -151,18 +153,26 @@ static void send_news(worker* w, int32_t kind) {
     w->said = gsfix_now();
 }
 
-// Listens to rank 0, and says `kind` once a second. Exits if there is no rank 0 any more.
-static void keep_in_touch(worker* w, int32_t kind) {
+// Takes a message of rank 0, if there is one. Exits if there is no rank 0 any more, or none has come for `patience` seconds.
+static int listen_to_chief(worker* w, double patience) {
     int there = 0;
     MPI_Iprobe(0, TAG_TO_WORKER, MPI_COMM_WORLD, &there, MPI_STATUS_IGNORE);
     if (there) {
         MPI_Recv(&w->last, (int)sizeof w->last, MPI_BYTE, 0, TAG_TO_WORKER, MPI_COMM_WORLD, MPI_STATUS_IGNORE);
         w->heard = gsfix_now();
     } else if (gsfix_now() - w->said > ALIVE_EVERY) {
-        if (!may_live(w->last.host, w->last.pid) || gsfix_now() - w->heard > 2.0 * LOST_AFTER) _exit(1); // takes the task along
-        send_news(w, kind);
+        if (!may_live(w->last.host, w->last.pid) || gsfix_now() - w->heard > patience) _exit(1); // takes the task along
+        w->said = gsfix_now();
+        return 0;
     }
+    return 1;
 }
+
+static void keep_in_touch(worker* w, int32_t kind) { // also says `kind` once a second
+    if (!listen_to_chief(w, 2.0 * LOST_AFTER)) send_news(w, kind);
+}
+
+static int is_over(const worker* w) { return w->last.task == ORDER_STOP || w->last.task == ORDER_LEAVE; }
 
 static void do_order(worker* w) {
     const order o = w->last;
@@ -173,10 +183,10 @@ static void do_order(worker* w) {
     w->n.text[0] = 0;
     for (int running = start_process(w->job, o.name, o.again, &p); running;) {
         keep_in_touch(w, NEWS_ALIVE);
-        if (w->last.task == ORDER_STOP) kill(p.pid, SIGINT); // leaves a checkpoint
+        if (is_over(w)) kill(p.pid, SIGINT); // leaves a checkpoint
         if (!has_ended(&p, &kind)) {
             pause_for(0.001);
-        } else if (kind == NEWS_FAILED && is_busy(&p) && gsfix_now() - begin < BUSY_MOST && w->last.task != ORDER_STOP) {
+        } else if (kind == NEWS_FAILED && is_busy(&p) && gsfix_now() - begin < BUSY_MOST && !is_over(w)) {
             pause_for(0.5); // the process of a rank that is thought lost; what it does counts, too
             running = start_process(w->job, o.name, 1, &p);
         } else {
@@ -188,14 +198,14 @@ static void do_order(worker* w) {
     send_news(w, kind);
 }
 
-static void work(const mpi_job* job) {
+static int work(const mpi_job* job) { // was a rank lost?
     static worker w; // zeroed
     w.job = job;
     w.heard = gsfix_now();
     w.n.pid = (int32_t)getpid();
     gethostname(w.n.host, sizeof w.n.host - 1);
     w.n.task = w.last.task = ORDER_NONE;
-    for (send_news(&w, NEWS_READY); w.last.task != ORDER_STOP;) {
+    for (send_news(&w, NEWS_READY); !is_over(&w);) {
         keep_in_touch(&w, NEWS_READY);
         if (w.last.task >= 0) {
             do_order(&w);
@@ -205,6 +215,11 @@ static void work(const mpi_job* job) {
             pause_for(0.001);
         }
     }
+    while (w.last.task != ORDER_LEAVE) { // rank 0 merges, and is silent meanwhile
+        (void)listen_to_chief(&w, MERGE_MOST);
+        pause_for(0.001);
+    }
+    return w.last.lost;
 }
 
 // ---- rank 0 --------------------------------------------------------------------------
@@ -261,6 +276,7 @@ static void send_to_all(int ranks, int64_t task) {
     order o;
     memset(&o, 0, sizeof o);
     o.task = task;
+    for (int i = 1; i < ranks; i++) o.lost |= lost_ranks[i];
     for (int i = 1; i < ranks; i++)
         if (!lost_ranks[i]) send_order(&o, i);
 }
@@ -386,7 +402,7 @@ static void on_alarm(int number) { // MPI waits for ranks that are lost
 int main(int argc, char** argv) {
     mpi_job job = {argc, argv, 0, 0};
     const gsfix_crew crew = {lead, &job};
-    int rank, ranks, code = 0;
+    int rank, ranks, code = 0, lost = 0;
     for (int i = 1; i < argc; i++) {
         if (strcmp(argv[i], "--task") == 0 || strncmp(argv[i], "--task=", 7) == 0) return gsfix_start(argc, argv, NULL);
         job.quiet |= strcmp(argv[i], "--json") == 0;
@@ -404,16 +420,22 @@ int main(int argc, char** argv) {
     lost_ranks = (uint8_t*)calloc((size_t)ranks, 1);
     if (!lost_ranks || !buffer) MPI_Abort(MPI_COMM_WORLD, 1);
     MPI_Buffer_attach(buffer, buffer_size);
-    if (rank > 0) work(&job);
+    if (rank > 0) lost = work(&job);
     else code = gsfix_start(argc, argv, &crew);
     if (rank == 0 && !workers_stopped) send_to_all(ranks, ORDER_STOP); // a mistake in the command line
-    fflush(stdout);
+    if (rank == 0) send_to_all(ranks, ORDER_LEAVE);
+    for (int i = 0; i < ranks; i++) lost |= lost_ranks[i];
+    fflush(NULL);
+    if (lost) {
+        for (int i = 0, there; rank == 0 && i < 200; i++) { // buffered messages leave while MPI is called
+            MPI_Iprobe(MPI_ANY_SOURCE, TAG_TO_CHIEF, MPI_COMM_WORLD, &there, MPI_STATUS_IGNORE);
+            pause_for(0.001);
+        }
+        _exit(code);
+    }
     exit_code = code;
     is_ending = 1;
-    int patience = rank > 0 ? MERGE_MOST : 6 * END_MOST; // a rank may be killed even now, and then MPI would wait for ever
-    for (int i = 0; i < ranks; i++)
-        if (lost_ranks[i]) patience = END_MOST;
-    alarm((unsigned)patience);
+    alarm(END_MOST); // a rank may be killed even now, and then MPI would wait for ever
     MPI_Finalize();
     free(lost_ranks);
     free(buffer);

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
+#include <ctype.h>
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
@@ -339,8 +340,9 @@ static char* take_name(gsf_context* ctx, const char* from, size_t size) {
     char* name = gsfix_copy_text(ctx, from, size);
     char* to = name;
     for (const char* p = name; p && *p; p++) {
-        unsigned byte;
-        if (*p == '%' && sscanf(p + 1, "%2x", &byte) == 1) *to++ = (char)byte, p += 2;
+        unsigned byte; // two digits: sscanf would also take a space or sign and one, and the end of the name for the second
+        if (*p == '%' && isxdigit((unsigned char)p[1]) && isxdigit((unsigned char)p[2]) && sscanf(p + 1, "%2x", &byte) == 1)
+            *to++ = (char)byte, p += 2;
         else *to++ = *p;
     }
     if (to) *to = 0;

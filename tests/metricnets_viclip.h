@@ -166,6 +166,7 @@ static void viclip_check_clip(gsf_context* ctx, const test_tensors* io, const ch
     }
     CHECK(seen.compared == 3 && metric.count == metric.frames);
     golden_near(key, metric.score, score, exact ? 2e-6 : 5e-5);
+    test_note_error("overall_consistency", fabs(metric.score - score));
     gsf_nn_destroy_metric(ctx, &metric);
     test_free_tensor(&frames);
 }

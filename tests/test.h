@@ -306,6 +306,14 @@ static inline int test_compare(const char* what, const double* actual, const dou
     return ok;
 }
 
+// For the tables of bench/results.py: a line about an error of a measure, appended to the file that GSF_TEST_ERRORS names.
+static inline void test_note_error(const char* of, double error) {
+    const char* path = getenv("GSF_TEST_ERRORS");
+    FILE* file = path ? fopen(path, "a") : NULL;
+    if (file) fprintf(file, "{\"error_of\": \"%s\", \"error\": %.3g}\n", of, error);
+    if (file) fclose(file);
+}
+
 static inline int test_compare_floats(const char* what, const float* actual, const double* expected, size_t count,
                                       double tolerance) {
     double* wide = (double*)malloc((count ? count : 1) * sizeof(double));

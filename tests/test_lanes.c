@@ -181,6 +181,13 @@ GSF__V_KERNEL void GSF__V(check_across)(void) {
         expected += (double)x[i];
     }
     CHECK_NEAR(gsf__vd_sum(sum), expected, 1e-9);
+    double doubles[MOST], copies[MOST];
+    for (int i = 0; i < MOST; i++) doubles[i] = 1.0 / (double)(i + 3);
+    for (int h = 0; h < GSF__HALVES; h++) {
+        const int at = h * (GSF__LANES / GSF__HALVES);
+        gsf__vd_write(copies + at, gsf__vd_read(doubles + at));
+    }
+    CHECK(memcmp(copies, doubles, GSF__LANES * sizeof(double)) == 0);
     folded = gsf__vd_add_folded(folded, v);
     CHECK_NEAR(gsf__vd_sum(folded), expected, GSF__LANES * 1e-3);
     gsf__vf pinned = v;

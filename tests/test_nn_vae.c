@@ -1,5 +1,5 @@
-// test_nn_vae.c - convolutions against a double-precision reference; a small random autoencoder: CPU levels, workers,
-// tiles, chunks, damaged files, NaN, cancellation, out of memory. golden_restorer compares with diffusers.
+// test_nn_vae.c - convolutions, those of the metrics, too, against a double-precision reference; a small random autoencoder:
+// CPU levels, workers, tiles, chunks, damaged files, NaN, cancellation, out of memory. golden_restorer compares with diffusers.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests tests/test_nn_vae.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -144,6 +144,82 @@ static void test_convolve(void) {
     desc.x = &value, desc.y = &value, desc.weight = &weight, desc.frames = desc.height = desc.width = 1;
     CHECK_RESULT(&ctx, gsf__nn_convolve(&ctx, NULL, &desc), GSF_ERROR_UNSUPPORTED);
     CHECK(strstr(ctx.error, "odd.weight") != NULL);
+}
+
+// ---- convolutions of feature maps (metrics), among them Winograd's
+
+// The convolution of `pad` zeros around `map` at `stride`, with ReLU of the input, in double.
+static void check_map_values(const gsf__map* map, const float* w, const float* bias, int64_t kernel, int64_t stride,
+                             int64_t pad, int rectify, const gsf__map* y) {
+    double worst = 0.0;
+    for (int64_t at = 0; at < y->images * y->height * y->width * y->channels; at++) {
+        const int64_t n = at % y->channels, pixel = at / y->channels, column = pixel % y->width * stride - pad;
+        const int64_t image = pixel / y->width / y->height, row = pixel / y->width % y->height * stride - pad;
+        double value = (double)bias[n], terms = fabs(value);
+        for (int64_t i = 0; i < map->channels; i++)
+            for (int64_t k = 0; k < kernel * kernel; k++) {
+                const int64_t v = row + k / kernel, u = column + k % kernel;
+                if (v < 0 || u < 0 || v >= map->height || u >= map->width) continue;
+                const float of = map->data[((image * map->height + v) * map->width + u) * map->pitch + i];
+                const double by = (double)w[(n * map->channels + i) * kernel * kernel + k];
+                const double term = (rectify && of < 0.0f ? 0.0 : (double)of) * by;
+                value += term;
+                terms += fabs(term);
+            }
+        const double error = fabs((double)y->data[pixel * y->pitch + n] - value) / terms;
+        if (!(error <= worst)) worst = error;
+    }
+    CHECK(worst < 1e-6);
+}
+
+static void check_map(gsf_context* ctx, gsf_context* other, const int64_t sizes[9], int rectify, uint64_t* seed) {
+    const int64_t kernel = sizes[5], stride = sizes[6], pad = sizes[7], spare = sizes[8]; // spare: channels of a wider map
+    gsf__map x = {NULL, sizes[0], sizes[1], sizes[2], sizes[3], sizes[3] + spare};
+    gsf__map y = {NULL, x.images, (x.height + 2 * pad - kernel) / stride + 1, (x.width + 2 * pad - kernel) / stride + 1,
+                  sizes[4], sizes[4] + spare};
+    const int64_t shape[4] = {y.channels, x.channels, kernel, kernel};
+    const size_t in = (size_t)(x.images * x.height * x.width * x.pitch);
+    const size_t out = (size_t)(y.images * y.height * y.width * y.pitch);
+    float *w = random_floats(seed, (size_t)(y.channels * x.channels * kernel * kernel), 1.0);
+    float *bias = random_floats(seed, (size_t)y.channels, 1.0), *again = (float*)calloc(out, sizeof(float));
+    const gsf_nn_tensor weight = gsf_nn_wrap_tensor("w", w, 4, shape), biases = gsf_nn_wrap_tensor("b", bias, 1, shape);
+    const gsf__nn_layer layer = {&weight, &biases};
+    gsf__map_layers layers;
+    memset(&layers, 0, sizeof layers);
+    x.data = random_floats(seed, in, 2.0);
+    y.data = (float*)calloc(out, sizeof(float));
+    for (int run = 0; run < 2; run++) // the second with the packed weights of the first
+        CHECK_OK(ctx, gsf__map_convolve(ctx, &layers, &layer, stride, pad, rectify, &x, &y));
+    CHECK(layers.count == 1);
+    check_map_values(&x, w, bias, kernel, stride, pad, rectify, &y);
+    for (size_t i = 0; i < out; i++) CHECK(i % (size_t)y.pitch < (size_t)y.channels || y.data[i] == 0.0f); // of the wider map
+    gsf__destroy_map_layers(ctx, &layers);
+    gsf__map same = y;
+    same.data = again;
+    CHECK_OK(other, gsf__map_convolve(other, &layers, &layer, stride, pad, rectify, &x, &same));
+    CHECK(memcmp(y.data, again, out * sizeof(float)) == 0);
+    gsf__destroy_map_layers(other, &layers);
+    free(w), free(bias), free(again), free(x.data), free(y.data);
+}
+
+static void test_maps(void) {
+    static const int64_t sizes[][9] = { // images, height, width, in, out, kernel, stride, pad, spare
+        {1, 1, 1, 16, 16, 3, 1, 1, 0},   {2, 7, 9, 16, 24, 3, 1, 1, 0},  {1, 24, 31, 40, 33, 3, 1, 1, 3},
+        {1, 2, 2, 300, 17, 3, 1, 1, 0},  {1, 33, 46, 17, 64, 3, 1, 1, 0}, {1, 9, 8, 3, 20, 3, 2, 0, 0},
+        {1, 19, 23, 3, 16, 11, 4, 2, 0}, {2, 6, 5, 20, 18, 5, 1, 2, 1},  {1, 5, 6, 24, 40, 1, 1, 0, 2},
+    };
+    gsf_context ctx, other;
+    uint64_t seed = 3;
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
+        test_context_zero(&ctx);
+        ctx.cpu_level = (gsf_cpu_level)level;
+        other = ctx;
+        other.parallel.for_fn = backwards;
+        other.parallel.worker_count = 3;
+        CHECK_OK(&ctx, gsf_init_context(&ctx));
+        CHECK_OK(&other, gsf_init_context(&other));
+        for (size_t i = 0; i < GSF__COUNT(sizes); i++) check_map(&ctx, &other, sizes[i], (int)(i % 2), &seed);
+    }
 }
 
 // ---- a random autoencoder
@@ -636,6 +712,7 @@ int main(void) {
     ctx.logger.log_fn = keep_warning;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_convolve();
+    test_maps();
     test_levels_and_workers();
     vae_file* file = make_file(&tiny);
     save_model(&ctx, &tiny, file);
