@@ -106,10 +106,15 @@
 #endif
 #endif
 
+#if defined(__MINGW32__) && defined(__GNUC__) && !defined(__clang__)
+#define GSF__PRINTF_KIND gnu_printf // the text functions use MinGW's own printf, not that of the C runtime, which has no %zu
+#else
+#define GSF__PRINTF_KIND printf
+#endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSF_NODISCARD __attribute__((warn_unused_result))
 #define GSF_RESTRICT __restrict__
-#define GSF_PRINTF(fmt, args) __attribute__((format(printf, fmt, args)))
+#define GSF_PRINTF(fmt, args) __attribute__((format(GSF__PRINTF_KIND, fmt, args)))
 #else
 #define GSF_NODISCARD
 #define GSF_RESTRICT __restrict
@@ -604,6 +609,20 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
+#if defined(_WIN32)
+#ifndef WIN32_LEAN_AND_MEAN
+#define WIN32_LEAN_AND_MEAN
+#endif
+#ifndef NOMINMAX
+#define NOMINMAX
+#endif
+#include <windows.h>
+#include <fcntl.h>
+#include <io.h>
+#elif defined(__unix__) || defined(__APPLE__)
+#include <sys/stat.h>
+#endif
 
 #ifndef GSF_ASSERT
 #include <assert.h>
@@ -617,9 +636,25 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__ALWAYS_INLINE
 #endif
 
-#if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
+// Kernels use target attributes and operators on vectors, which GCC and Clang (also as clang-cl) have; the compiler of
+// Visual Studio, which has neither in C, gets the scalar ones.
+#if !defined(GSF_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) && \
+    ((defined(__GNUC__) && !defined(__TINYC__)) || defined(__clang__))
 #define GSF__X86 1
 #include <immintrin.h>
+#if defined(_MSC_VER)
+#include <intrin.h>
+#else
+#include <cpuid.h>
+#endif
+#if defined(__MINGW32__) && !defined(__clang__)
+// The stack is aligned to 16 bytes only on Windows, and GCC does not align its own spills of wider registers there (GCC bug
+// 54412), so its aligned moves are assembled as unaligned ones, which are as fast.
+__asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
+        ".macro vmovaps args:vararg\nvmovups \\args\n.endm\n.macro vmovapd args:vararg\nvmovupd \\args\n.endm\n"
+        ".macro vmovdqa args:vararg\nvmovdqu \\args\n.endm\n.macro vmovdqa32 args:vararg\nvmovdqu32 \\args\n.endm\n"
+        ".macro vmovdqa64 args:vararg\nvmovdqu64 \\args\n.endm\n.endif");
+#endif
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
 #define GSF__INLINE_AVX2 GSF__TARGET_AVX2 GSF__ALWAYS_INLINE static inline
 #define GSF__AVX512 "avx2,fma,f16c,bmi,avx512f,avx512bw,avx512dq,avx512vl"
@@ -644,7 +679,13 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__END_IMPLEMENTATION _Pragma("STDC FP_CONTRACT DEFAULT")
 #elif defined(__GNUC__)
 // g++ before 13 takes the operands that its AVX-512 intrinsics leave undefined for uninitialised variables (GCC bug 105593).
-#if defined(__cplusplus) && __GNUC__ < 13
+#if defined(__MINGW32__) // isfinite and isnan are macros that convert to float; rpcndr.h has a type named byte
+#define GSF__BEGIN_QUIET                                                                                \
+    _Pragma("GCC diagnostic push") _Pragma("GCC diagnostic ignored \"-Wfloat-conversion\"")             \
+        _Pragma("GCC diagnostic ignored \"-Wshadow\"") _Pragma("GCC diagnostic ignored \"-Wuninitialized\"") \
+            _Pragma("GCC diagnostic ignored \"-Wmaybe-uninitialized\"")
+#define GSF__END_QUIET _Pragma("GCC diagnostic pop")
+#elif defined(__cplusplus) && __GNUC__ < 13
 #define GSF__BEGIN_QUIET                                                                        \
     _Pragma("GCC diagnostic push") _Pragma("GCC diagnostic ignored \"-Wuninitialized\"")        \
         _Pragma("GCC diagnostic ignored \"-Wmaybe-uninitialized\"")
@@ -680,6 +721,24 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
     } while (0)
 
 #define GSF__COUNT(array) (sizeof(array) / sizeof((array)[0]))
+
+// Whether operations on doubles are rounded to double at once (not so on the x87).
+#if defined(FLT_EVAL_METHOD)
+#define GSF__PLAIN_DOUBLES (FLT_EVAL_METHOD == 0)
+#else
+#define GSF__PLAIN_DOUBLES 0
+#endif
+
+// MinGW's own, since the C runtime that it links has no %zu in some versions and rounds wrongly in others.
+#if defined(__MINGW32__)
+#define GSF__SNPRINTF __mingw_snprintf
+#define GSF__VSNPRINTF __mingw_vsnprintf
+#define GSF__STRTOD __mingw_strtod
+#else
+#define GSF__SNPRINTF snprintf
+#define GSF__VSNPRINTF vsnprintf
+#define GSF__STRTOD strtod
+#endif
 
 GSF__BEGIN_IMPLEMENTATION
 
@@ -867,7 +926,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
     double result = 0.0;
     if (kept == 0) {
         result = 0.0;
-    } else if (FLT_EVAL_METHOD == 0 && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
+    } else if (GSF__PLAIN_DOUBLES && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
                exponent <= 22) { // both operands are exact, so the result is rounded once
         result = exponent < 0 ? (double)mantissa / powers[-exponent] : (double)mantissa * powers[exponent];
     } else {
@@ -878,7 +937,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
         if (exponent > 9999) exponent = 9999;
         if (exponent < -9999) exponent = -9999;
         snprintf(digits + kept, sizeof digits - kept, "e%d", (int)exponent);
-        result = strtod(digits, NULL);
+        result = GSF__STRTOD(digits, NULL);
     }
     *out = text[0] == '-' ? -result : result;
     return at;
@@ -1053,10 +1112,204 @@ GSF__SHARED gsf__carry_fn gsf__carry_fn_of(const gsf_restore_window* window) {
     return window->struct_size >= sizeof *window ? window->carry_fn : NULL;
 }
 
-// Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist either.
+// Result for the errno of a failed gsf__open_path. A path below a regular file (ENOTDIR) does not exist either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
+
+// ---- platform: clock, text, files. All paths are UTF-8; on failure the functions return -1 or NULL and set errno.
+
+typedef enum gsf__path_kind { GSF__PATH_UNKNOWN, GSF__PATH_FILE, GSF__PATH_FOLDER, GSF__PATH_DEVICE } gsf__path_kind;
+typedef enum gsf__open_mode { // WRITE is for devices; NEW fails if there is anything of that name, even a link
+    GSF__OPEN_READ, GSF__OPEN_WRITE, GSF__OPEN_NEW
+} gsf__open_mode;
+
+#if defined(_WIN32)
+
+GSF__SHARED double gsf__seconds(void) { // of a clock that only goes forward; for statistics only
+    LARGE_INTEGER ticks, per_second;
+    QueryPerformanceCounter(&ticks);
+    QueryPerformanceFrequency(&per_second);
+    return (double)ticks.QuadPart / (double)per_second.QuadPart;
+}
+
+GSF__SHARED int gsf__seek(FILE* file, int64_t offset, int from) { return _fseeki64(file, offset, from); }
+GSF__SHARED int64_t gsf__tell(FILE* file) { return _ftelli64(file); }
+
+GSF__SHARED int gsf__set_errno(DWORD reason) {
+    switch (reason) {
+        case ERROR_FILE_NOT_FOUND:
+        case ERROR_PATH_NOT_FOUND:
+        case ERROR_INVALID_NAME:
+        case ERROR_BAD_NETPATH:
+        case ERROR_INVALID_DRIVE: errno = ENOENT; break;
+        case ERROR_ACCESS_DENIED:
+        case ERROR_WRITE_PROTECT: errno = EACCES; break;
+        case ERROR_SHARING_VIOLATION:
+        case ERROR_LOCK_VIOLATION: errno = EBUSY; break;
+        case ERROR_FILE_EXISTS:
+        case ERROR_ALREADY_EXISTS: errno = EEXIST; break;
+        case ERROR_DISK_FULL:
+        case ERROR_HANDLE_DISK_FULL: errno = ENOSPC; break;
+        case ERROR_FILENAME_EXCED_RANGE: errno = ENAMETOOLONG; break;
+        case ERROR_DIRECTORY: errno = ENOTDIR; break;
+        default: errno = EIO;
+    }
+    return -1;
+}
+
+enum { GSF__SHORT_PATH = 240 }; // in UTF-16 units; longer ones need the form \\?\, which no other program has to understand
+
+// A path for the W functions, freed with gsf_free; NULL if it is not UTF-8 or memory is out.
+GSF__SHARED wchar_t* gsf__wide_path(gsf_context* ctx, const char* path) {
+    const int size = MultiByteToWideChar(CP_UTF8, MB_ERR_INVALID_CHARS, path, -1, NULL, 0);
+    errno = ENOENT; // no file can have such a name
+    if (size < 1) return NULL;
+    errno = ENOMEM;
+    wchar_t* wide = (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide);
+    if (!wide) return NULL;
+    MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, size);
+    const int verbatim = wide[0] == L'\\' && wide[1] == L'\\' && (wide[2] == L'?' || wide[2] == L'.');
+    const DWORD room = verbatim ? 0 : GetFullPathNameW(wide, 0, NULL, NULL); // with the zero
+    if (room <= GSF__SHORT_PATH) return wide;
+    wchar_t* whole = (wchar_t*)gsf_alloc(ctx, (size_t)room + 8, sizeof *whole); // 8: of the longest prefix
+    const DWORD used = whole ? GetFullPathNameW(wide, room, whole + 8, NULL) : 0;
+    gsf_free(ctx, wide);
+    if (used == 0 || used >= room) {
+        gsf_free(ctx, whole);
+        return NULL;
+    }
+    const int network = whole[8] == L'\\' && whole[9] == L'\\'; // \\server\share becomes \\?\UNC\server\share
+    const wchar_t* prefix = network ? L"\\\\?\\UNC" : L"\\\\?\\";
+    const size_t length = network ? 7 : 4;
+    memcpy(whole, prefix, length * sizeof *whole);
+    memmove(whole + length, whole + 8 + network, ((size_t)used + 1 - (size_t)network) * sizeof *whole);
+    return whole;
+}
+
+GSF__SHARED gsf__path_kind gsf__look_at_path(gsf_context* ctx, const char* path) {
+    wchar_t* wide = gsf__wide_path(ctx, path);
+    if (!wide) return GSF__PATH_UNKNOWN;
+    const DWORD attributes = GetFileAttributesW(wide);
+    gsf__path_kind kind = GSF__PATH_UNKNOWN;
+    HANDLE file = INVALID_HANDLE_VALUE;
+    if (attributes != INVALID_FILE_ATTRIBUTES && (attributes & FILE_ATTRIBUTE_DIRECTORY)) kind = GSF__PATH_FOLDER;
+    else
+        file = CreateFileW(wide, 0, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, OPEN_EXISTING, 0, NULL);
+    if (file != INVALID_HANDLE_VALUE) {
+        kind = GetFileType(file) == FILE_TYPE_DISK ? GSF__PATH_FILE : GSF__PATH_DEVICE;
+        CloseHandle(file);
+    }
+    gsf_free(ctx, wide);
+    return kind;
+}
+
+// Waits before a file that somebody else has open is tried again; about a second in all. Returns 0 when that is over.
+GSF__SHARED int gsf__wait_for_path(int attempt) {
+    if (attempt >= 40) return 0;
+    Sleep(attempt < 8 ? 2 : 30);
+    return 1;
+}
+
+// Others may read, replace and remove the file meanwhile, as on other platforms.
+GSF__SHARED HANDLE gsf__open_handle(gsf_context* ctx, const char* path, DWORD access, DWORD how, DWORD flags) {
+    wchar_t* wide = gsf__wide_path(ctx, path);
+    if (!wide) return INVALID_HANDLE_VALUE;
+    HANDLE file = INVALID_HANDLE_VALUE;
+    for (int attempt = 0; file == INVALID_HANDLE_VALUE; attempt++) {
+        file = CreateFileW(wide, access, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, how, flags, NULL);
+        const DWORD reason = GetLastError();
+        if (file != INVALID_HANDLE_VALUE) break;
+        gsf__set_errno(reason);
+        if (reason != ERROR_SHARING_VIOLATION || !gsf__wait_for_path(attempt)) break;
+    }
+    const int reason = errno;
+    gsf_free(ctx, wide);
+    errno = reason;
+    return file;
+}
+
+GSF__SHARED FILE* gsf__open_path(gsf_context* ctx, const char* path, gsf__open_mode mode) {
+    const int reads = mode == GSF__OPEN_READ;
+    HANDLE handle = gsf__open_handle(ctx, path, reads ? GENERIC_READ : GENERIC_WRITE, mode == GSF__OPEN_NEW ? CREATE_NEW :
+                                     OPEN_EXISTING, FILE_ATTRIBUTE_NORMAL);
+    if (handle == INVALID_HANDLE_VALUE) return NULL;
+    const int descriptor = _open_osfhandle((intptr_t)handle, reads ? _O_RDONLY | _O_BINARY : _O_BINARY);
+    FILE* file = descriptor < 0 ? NULL : _fdopen(descriptor, reads ? "rb" : "wb");
+    if (!file && descriptor >= 0) _close(descriptor);
+    else if (!file) CloseHandle(handle);
+    return file;
+}
+
+// A virus scanner or a reader of the old file makes it fail for a moment, in which the old file stays as it is.
+GSF__SHARED int gsf__replace_path(gsf_context* ctx, const char* from, const char* to) {
+    wchar_t *wide_from = gsf__wide_path(ctx, from), *wide_to = gsf__wide_path(ctx, to);
+    int result = -1;
+    for (int attempt = 0; wide_from && wide_to && result != 0; attempt++) {
+        if (MoveFileExW(wide_from, wide_to, MOVEFILE_REPLACE_EXISTING | MOVEFILE_WRITE_THROUGH)) result = 0;
+        const DWORD reason = GetLastError();
+        if (result == 0) break;
+        gsf__set_errno(reason);
+        const DWORD there = GetFileAttributesW(wide_to); // a folder or a protected file will not give way
+        const int lasting = there != INVALID_FILE_ATTRIBUTES && (there & (FILE_ATTRIBUTE_DIRECTORY | FILE_ATTRIBUTE_READONLY));
+        if ((reason != ERROR_SHARING_VIOLATION && reason != ERROR_ACCESS_DENIED) || lasting || !gsf__wait_for_path(attempt))
+            break;
+    }
+    const int reason = errno;
+    gsf_free(ctx, wide_from);
+    gsf_free(ctx, wide_to);
+    errno = reason;
+    return result;
+}
+
+GSF__SHARED void gsf__remove_path(gsf_context* ctx, const char* path) {
+    wchar_t* wide = gsf__wide_path(ctx, path);
+    if (wide) DeleteFileW(wide);
+    gsf_free(ctx, wide);
+}
+
+#else
+
+GSF__SHARED double gsf__seconds(void) { // for statistics only
+#ifdef TIME_UTC
+    struct timespec t;
+    return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
+#else
+    return (double)clock() / (double)CLOCKS_PER_SEC;
+#endif
+}
+
+GSF__SHARED int gsf__seek(FILE* file, int64_t offset, int from) { return fseek(file, (long)offset, from); }
+GSF__SHARED int64_t gsf__tell(FILE* file) { return ftell(file); }
+
+GSF__SHARED gsf__path_kind gsf__look_at_path(gsf_context* ctx, const char* path) {
+    (void)ctx;
+#if defined(__unix__) || defined(__APPLE__)
+    struct stat info;
+    if (stat(path, &info) != 0) return GSF__PATH_UNKNOWN;
+    return S_ISREG(info.st_mode) ? GSF__PATH_FILE : S_ISDIR(info.st_mode) ? GSF__PATH_FOLDER : GSF__PATH_DEVICE;
+#else
+    (void)path;
+    return GSF__PATH_UNKNOWN;
+#endif
+}
+
+GSF__SHARED FILE* gsf__open_path(gsf_context* ctx, const char* path, gsf__open_mode mode) {
+    (void)ctx;
+    return fopen(path, mode == GSF__OPEN_READ ? "rb" : mode == GSF__OPEN_WRITE ? "wb" : "wbx");
+}
+
+GSF__SHARED int gsf__replace_path(gsf_context* ctx, const char* from, const char* to) {
+    (void)ctx;
+    return rename(from, to);
+}
+
+GSF__SHARED void gsf__remove_path(gsf_context* ctx, const char* path) {
+    (void)ctx;
+    remove(path);
+}
+
+#endif
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
@@ -1760,16 +2013,50 @@ GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level) {
     return "unknown";
 }
 
+#if GSF__X86
+static void gsf__cpuid(unsigned leaf, unsigned subleaf, unsigned out[4]) { // eax, ebx, ecx, edx; 0 if there is no such leaf
+    memset(out, 0, 4 * sizeof *out);
+#if defined(_MSC_VER)
+    int registers[4];
+    __cpuid(registers, 0);
+    if ((unsigned)registers[0] < leaf) return;
+    __cpuidex(registers, (int)leaf, (int)subleaf);
+    for (int i = 0; i < 4; i++) out[i] = (unsigned)registers[i];
+#else
+    if (!__get_cpuid_count(leaf, subleaf, &out[0], &out[1], &out[2], &out[3])) memset(out, 0, 4 * sizeof *out);
+#endif
+}
+
+// Register state that the operating system saves (XCR0). Needs OSXSAVE.
+static uint64_t gsf__saved_state(void) {
+#if defined(_MSC_VER)
+    return _xgetbv(0);
+#else
+    uint32_t low, high;
+    __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+    return (uint64_t)high << 32 | low;
+#endif
+}
+#endif
+
+// By cpuid itself: __builtin_cpu_supports needs a run-time library that clang-cl does not link.
 static gsf_cpu_level gsf__detect_cpu_level(void) {
 #if GSF__X86
-    __builtin_cpu_init();
-    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !__builtin_cpu_supports("bmi"))
-        return GSF_CPU_SCALAR;
-    if (!__builtin_cpu_supports("avx512f") || !__builtin_cpu_supports("avx512bw") ||
-        !__builtin_cpu_supports("avx512dq") || !__builtin_cpu_supports("avx512vl"))
-        return GSF_CPU_AVX2;
-    if (!__builtin_cpu_supports("avx512vnni")) return GSF_CPU_AVX512;
-    return __builtin_cpu_supports("avx512bf16") ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
+    const unsigned fma = 1u << 12, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;             // leaf 1, ecx
+    const unsigned bmi = 1u << 3, avx2 = 1u << 5, f_dq = 1u << 16 | 1u << 17, bw_vl = 3u << 30;     // leaf 7, ebx
+    const unsigned vnni = 1u << 11, bf16 = 1u << 5;                                                 // ecx; leaf 7.1, eax
+    const uint64_t ymm = 6, zmm = 0xe6;                                                             // in XCR0
+    unsigned one[4], seven[4], more[4];
+    gsf__cpuid(1, 0, one);
+    gsf__cpuid(7, 0, seven);
+    gsf__cpuid(7, 1, more);
+    const unsigned first = fma | osxsave | avx | f16c;
+    if ((one[2] & first) != first || (seven[1] & (bmi | avx2)) != (bmi | avx2)) return GSF_CPU_SCALAR;
+    const uint64_t saved = gsf__saved_state();
+    if ((saved & ymm) != ymm) return GSF_CPU_SCALAR;
+    if ((saved & zmm) != zmm || (seven[1] & (f_dq | bw_vl)) != (f_dq | bw_vl)) return GSF_CPU_AVX2;
+    if (!(seven[2] & vnni)) return GSF_CPU_AVX512;
+    return more[0] & bf16 ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
 #else
     return GSF_CPU_SCALAR;
 #endif
@@ -1780,7 +2067,7 @@ GSF_API void gsf_log(gsf_context* ctx, gsf_log_level level, const char* format, 
     char text[1024];
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     ctx->logger.log_fn(ctx->logger.user, level, text);
 }
@@ -1789,7 +2076,7 @@ GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* for
     char text[sizeof ctx->error]; // arguments may point into ctx->error
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     for (char* c = text; *c; c++)
         if ((unsigned char)*c < 0x20 || *c == 0x7f) *c = '?';
@@ -1940,17 +2227,17 @@ GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* text, const char* for
     va_list args, again;
     va_start(args, format);
     va_copy(again, args);
-    char small[512];
-    const int length = vsnprintf(small, sizeof small, format, args);
+    char inside[512];
+    const int length = GSF__VSNPRINTF(inside, sizeof inside, format, args);
     va_end(args);
     if (length < 0) {
         text->failed = 1;
-    } else if ((size_t)length < sizeof small) {
-        gsf_append_bytes(ctx, text, small, (size_t)length);
+    } else if ((size_t)length < sizeof inside) {
+        gsf_append_bytes(ctx, text, inside, (size_t)length);
     } else if (!text->failed) {
         if (gsf__reserve(ctx, (void**)&text->data, &text->capacity, text->size, text->size + (size_t)length + 1, 1) ==
             GSF_OK) {
-            vsnprintf(text->data + text->size, (size_t)length + 1, format, again);
+            GSF__VSNPRINTF(text->data + text->size, (size_t)length + 1, format, again);
             text->size += (size_t)length;
         } else {
             text->failed = 1;
@@ -2010,30 +2297,13 @@ GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text) {
 
 // ---- >>files -------------------------------------------------------------------
 
-#if defined(__unix__) || defined(__APPLE__)
-#include <sys/stat.h>
-// Whether path is a device (/dev/stdout) or a pipe, which has to be written in place: a rename would replace it.
-static int gsf__is_device(const char* path) {
-    struct stat info;
-    return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
-}
-
-// Why an existing file must not be read, or NULL: opening a pipe blocks until it has a writer, and a device may never end.
-static const char* gsf__why_unreadable(const char* path) {
-    struct stat info;
-    if (stat(path, &info) != 0 || S_ISREG(info.st_mode)) return NULL;
-    return S_ISDIR(info.st_mode) ? "is a folder" : "is not a regular file";
-}
-#else
-static int gsf__is_device(const char* path) { (void)path; return 0; }
-static const char* gsf__why_unreadable(const char* path) { (void)path; return NULL; }
-#endif
-
-// Opens a file for reading; *out is NULL on failure.
+// Opens a file for reading; *out is NULL on failure. Opening a pipe would block until it has a writer, and a device may never
+// end.
 static gsf_result gsf__open_file(gsf_context* ctx, const char* path, FILE** out) {
-    const char* reason = gsf__why_unreadable(path);
+    const gsf__path_kind kind = gsf__look_at_path(ctx, path);
+    const char* reason = kind == GSF__PATH_FOLDER ? "is a folder" : kind == GSF__PATH_DEVICE ? "is not a regular file" : NULL;
     errno = 0;
-    *out = reason ? NULL : fopen(path, "rb");
+    *out = reason ? NULL : gsf__open_path(ctx, path, GSF__OPEN_READ);
     if (*out) return GSF_OK;
     return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, reason ? reason : strerror(errno));
 }
@@ -2058,11 +2328,11 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
             if (ferror(file)) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
             break;
         }
-        if (first && fseek(file, 0, SEEK_END) == 0) {
-            const long end = ftell(file);
-            if (end >= 0 && (unsigned long)end >= buffer.size)
+        if (first && gsf__seek(file, 0, SEEK_END) == 0) {
+            const int64_t end = gsf__tell(file);
+            if (end >= 0 && (uint64_t)end >= buffer.size && (uint64_t)end < SIZE_MAX / 2)
                 step = (size_t)end - buffer.size + 1;  // + 1, so that fread reaches the end of the file
-            if (fseek(file, (long)buffer.size, SEEK_SET) != 0) {
+            if (gsf__seek(file, (int64_t)buffer.size, SEEK_SET) != 0) {
                 result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
                 break;
             }
@@ -2086,7 +2356,7 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name)
         name->size = 0;
         gsf_append_text(ctx, name, i ? "%s.tmp%d" : "%s.tmp", path, i);
         errno = 0;
-        FILE* file = name->failed ? NULL : fopen(name->data, "wbx");
+        FILE* file = name->failed ? NULL : gsf__open_path(ctx, name->data, GSF__OPEN_NEW);
         if (file || name->failed || errno != EEXIST) return file;
     }
     return NULL;
@@ -2096,11 +2366,11 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name)
 // power failure can still lose data, because there is no fsync.
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
-    const int device = gsf__is_device(path);
+    const int device = gsf__look_at_path(ctx, path) == GSF__PATH_DEVICE; // as /dev/stdout: a rename would replace it
     gsf_buffer name;
     memset(&name, 0, sizeof name);
     gsf_result result = GSF_OK;
-    FILE* file = device ? fopen(path, "wb") : gsf__open_new(ctx, path, &name);
+    FILE* file = device ? gsf__open_path(ctx, path, GSF__OPEN_WRITE) : gsf__open_new(ctx, path, &name);
     if (name.failed) {
         result = GSF_ERROR_OUT_OF_MEMORY;
     } else if (!file) {
@@ -2113,16 +2383,12 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
             ok = 0;
             reason = errno;
         }
-        if (ok && !device && rename(name.data, path) != 0) {
-#ifdef _WIN32 // rename does not replace existing files there
-            ok = remove(path) == 0 && rename(name.data, path) == 0;
-#else
+        if (ok && !device && gsf__replace_path(ctx, name.data, path) != 0) {
             ok = 0;
-#endif
             reason = errno;
         }
         if (!ok) {
-            if (!device) remove(name.data);
+            if (!device) gsf__remove_path(ctx, name.data);
             result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(reason));
         }
     }
@@ -2742,11 +3008,11 @@ static void gsf__put_packed(gsf__deflater* d, int last, const uint8_t* bits) {
             gsf__put_bits(d, codes[low], bits[low]);
             continue;
         }
-        const gsf__lz_class l = gsf__length_class(length), far = gsf__distance_class(low);
+        const gsf__lz_class l = gsf__length_class(length), reach = gsf__distance_class(low);
         gsf__put_bits(d, codes[l.code], bits[l.code]);
         gsf__put_bits(d, l.extra, l.extra_bits);
-        gsf__put_bits(d, distance_codes[far.code], distance_bits[far.code]);
-        gsf__put_bits(d, far.extra, far.extra_bits);
+        gsf__put_bits(d, distance_codes[reach.code], distance_bits[reach.code]);
+        gsf__put_bits(d, reach.extra, reach.extra_bits);
     }
     gsf__put_bits(d, codes[GSF__BLOCK_END], bits[GSF__BLOCK_END]);
 }
@@ -2875,6 +3141,9 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
 #define STBI_ONLY_PNM
 #define STBI_NO_GIF
 #define STBI_NO_STDIO
+#ifdef __TINYC__ // no intrinsics
+#define STBI_NO_SIMD
+#endif
 #define STBI_ASSERT(x) ((void)0) // damaged files trigger some of them
 // Zeroed memory makes the pixels of damaged files deterministic: stb leaves parts unwritten, such as the tables of a scan or
 // the end of a row.
@@ -3162,7 +3431,7 @@ static void gsf__stb_skip(void* user, int n) {
     gsf__stb_source* s = (gsf__stb_source*)user;
     if (n < 0) return;
     if (s->file) {
-        if (fseek(s->file, n, SEEK_CUR) != 0) s->overrun = 1;
+        if (gsf__seek(s->file, n, SEEK_CUR) != 0) s->overrun = 1;
     } else if ((size_t)n > s->size - s->at) {
         s->overrun = 1;
         n = (int)(s->size - s->at);

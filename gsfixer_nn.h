@@ -912,9 +912,7 @@ typedef struct gsf__nn_files {
     size_t count, capacity, tensor_capacity;
 } gsf__nn_files;
 
-// ---- platform: the kind of a path, listing a folder, mapping a file
-
-typedef enum gsf__nn_path_kind { GSF__NN_UNKNOWN, GSF__NN_IS_FILE, GSF__NN_IS_FOLDER } gsf__nn_path_kind;
+// ---- platform: listing a folder, mapping a file
 
 // The name of the only file in `folder` that ends in `suffix`; empty if there is none. More than one is an error.
 typedef struct gsf__nn_listing {
@@ -927,33 +925,27 @@ static int gsf__nn_ends_in(const char* text, const char* suffix) {
     return size >= end && memcmp(text + size - end, suffix, end) == 0;
 }
 
+static gsf_result gsf__nn_list_name(gsf_context* ctx, gsf__nn_listing* listing, const char* name) {
+    if (name[0] == '.' || !gsf__nn_ends_in(name, listing->suffix)) return GSF_OK;
+    if (listing->found.size)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: contains both %s and %s: pass a prefix", listing->folder,
+                        listing->found.data, name);
+    gsf_append_bytes(ctx, &listing->found, name, strlen(name));
+    return listing->found.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
 #if defined(__unix__) || defined(__APPLE__)
 #include <dirent.h>
 #include <fcntl.h>
 #include <sys/mman.h>
-#include <sys/stat.h>
 #include <unistd.h>
-
-static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) {
-    struct stat info;
-    if (stat(path, &info) != 0) return GSF__NN_UNKNOWN;
-    return S_ISDIR(info.st_mode) ? GSF__NN_IS_FOLDER : GSF__NN_IS_FILE;
-}
 
 static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
     DIR* folder = opendir(listing->folder);
     if (!folder) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", listing->folder, strerror(errno));
     gsf_result result = GSF_OK;
-    for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
-        if (entry->d_name[0] == '.' || !gsf__nn_ends_in(entry->d_name, listing->suffix)) continue;
-        if (listing->found.size) {
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: contains both %s and %s: pass a prefix",
-                              listing->folder, listing->found.data, entry->d_name);
-        } else {
-            gsf_append_bytes(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
-            if (listing->found.failed) result = GSF_ERROR_OUT_OF_MEMORY;
-        }
-    }
+    for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;)
+        result = gsf__nn_list_name(ctx, listing, entry->d_name);
     closedir(folder);
     return result;
 }
@@ -978,9 +970,53 @@ static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned
 }
 
 static void gsf__nn_unmap(const unsigned char* data, size_t size) { munmap((void*)(uintptr_t)data, size); }
-#else
-static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) { (void)path; return GSF__NN_UNKNOWN; }
+#elif defined(_WIN32)
+static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
+    gsf_buffer pattern;
+    memset(&pattern, 0, sizeof pattern);
+    gsf_append_text(ctx, &pattern, "%s/*", listing->folder);
+    wchar_t* wide = pattern.failed ? NULL : gsf__wide_path(ctx, pattern.data);
+    WIN32_FIND_DATAW entry;
+    HANDLE folder = wide ? FindFirstFileW(wide, &entry) : INVALID_HANDLE_VALUE;
+    if (wide && folder == INVALID_HANDLE_VALUE) gsf__set_errno(GetLastError());
+    const int reason = errno;
+    gsf_free(ctx, wide);
+    gsf_destroy_buffer(ctx, &pattern);
+    if (folder == INVALID_HANDLE_VALUE)
+        return gsf_fail(ctx, gsf__open_result(reason), "%s: %s", listing->folder, strerror(reason));
+    gsf_result result = GSF_OK;
+    do {
+        char name[3 * GSF__COUNT(entry.cFileName)]; // a unit of UTF-16 takes up to three bytes of UTF-8
+        if (WideCharToMultiByte(CP_UTF8, WC_ERR_INVALID_CHARS, entry.cFileName, -1, name, sizeof name, NULL, NULL) > 0)
+            result = gsf__nn_list_name(ctx, listing, name);
+    } while (result == GSF_OK && FindNextFileW(folder, &entry));
+    FindClose(folder);
+    return result;
+}
 
+// *data is NULL if the file cannot be mapped; it may still be readable.
+static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned char** data, size_t* size) {
+    *data = NULL;
+    *size = 0;
+    HANDLE file = gsf__open_handle(ctx, path, GENERIC_READ, OPEN_EXISTING, FILE_ATTRIBUTE_NORMAL);
+    if (file == INVALID_HANDLE_VALUE) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, strerror(errno));
+    LARGE_INTEGER bytes;
+    if (GetFileType(file) == FILE_TYPE_DISK && GetFileSizeEx(file, &bytes) && bytes.QuadPart > 0 &&
+        (uint64_t)bytes.QuadPart <= SIZE_MAX / 2) {
+        HANDLE mapping = CreateFileMappingW(file, NULL, PAGE_READONLY, 0, 0, NULL);
+        if (mapping) *data = (const unsigned char*)MapViewOfFile(mapping, FILE_MAP_READ, 0, 0, 0);
+        if (*data) *size = (size_t)bytes.QuadPart;
+        if (mapping) CloseHandle(mapping); // the view keeps it
+    }
+    CloseHandle(file);
+    return GSF_OK;
+}
+
+static void gsf__nn_unmap(const unsigned char* data, size_t size) {
+    (void)size;
+    UnmapViewOfFile(data);
+}
+#else
 static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
     (void)ctx;
     (void)listing;
@@ -1291,7 +1327,7 @@ static gsf_result gsf__pth_fail(const gsf__pth* p, gsf_result result, size_t at,
     char text[300];
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     return gsf_fail(p->ctx, result, "%s:%zu: %s", p->name, at, text);
 }
@@ -2353,7 +2389,7 @@ static gsf_result gsf__nn_open_prefix(gsf_context* ctx, const char* folder, cons
     char name[256];
     *found = 0;
     for (size_t i = 0; i < (may_lack ? 3 : 4) && !result && !*found; i++) {
-        if ((size_t)snprintf(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
+        if ((size_t)GSF__SNPRINTF(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a prefix of %zu bytes", folder, strlen(prefix));
         result = gsf__nn_open_named(ctx, folder, name, i < 3, found, weights);
     }
@@ -2366,7 +2402,7 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
     static const char* const usual[] = {"diffusion_pytorch_model", "model"};
     gsf_result result = GSF_OK;
     int found = 0;
-    if (!gsf__io_is_plain(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
+    if (!gsf__io_is_plain(ctx) || gsf__look_at_path(ctx, folder) == GSF__PATH_UNKNOWN) {
         for (size_t i = 0; i < GSF__COUNT(usual) && result == GSF_OK && !found; i++)
             result = gsf__nn_open_prefix(ctx, folder, usual[i], 1, &found, weights);
     }
@@ -2415,11 +2451,11 @@ static int gsf__nn_names_weights(const char* path) {
 GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, path, out);
     if (result != GSF_OK) return result;
-    const gsf__nn_path_kind kind = gsf__io_is_plain(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
+    const gsf__path_kind kind = gsf__io_is_plain(ctx) ? gsf__look_at_path(ctx, path) : GSF__PATH_UNKNOWN;
     int found;
-    if (kind != GSF__NN_IS_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
+    if (kind != GSF__PATH_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
         result = gsf__nn_open_index_file(ctx, path, out);
-    } else if (kind == GSF__NN_IS_FILE || (kind == GSF__NN_UNKNOWN && gsf__nn_names_weights(path))) {
+    } else if ((kind != GSF__PATH_FOLDER && kind != GSF__PATH_UNKNOWN) || (kind == GSF__PATH_UNKNOWN && gsf__nn_names_weights(path))) {
         result = gsf__nn_add_file(ctx, path, out);
         if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
     } else if (prefix) {
@@ -2609,7 +2645,7 @@ GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_nn_tensor*
     char name[256];
     va_list args;
     va_start(args, format);
-    vsnprintf(name, sizeof name, format, args);
+    GSF__VSNPRINTF(name, sizeof name, format, args);
     va_end(args);
     return gsf__nn_take(loader, name, out, rank, shape);
 }
@@ -2758,7 +2794,7 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
     char wanted[80];
     *count = 0;
     if (!value || value->type != GSF_JSON_ARRAY || value->count < 1 || value->count > room) {
-        snprintf(wanted, sizeof wanted, "a list of 1 to %zu whole numbers", room);
+        GSF__SNPRINTF(wanted, sizeof wanted, "a list of 1 to %zu whole numbers", room);
         return gsf__nn_config_fail(config, value, key, wanted);
     }
     for (uint32_t i = value->child; i; i = config->json.values[i].next)
@@ -6894,7 +6930,7 @@ static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t fi
     if (!run->tap || !data) return;
     const size_t size = (size_t)snprintf(name, sizeof name, "%s", run->label);
     va_start(args, format);
-    vsnprintf(name + size, sizeof name - size, format, args);
+    GSF__VSNPRINTF(name + size, sizeof name - size, format, args);
     va_end(args);
     for (int64_t i = 0; i < count; i++)
         run->tap->fn(run->tap->user, name, (int32_t)(first + i), data + i * rows * columns, rows, columns);

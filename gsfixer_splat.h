@@ -763,7 +763,6 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 #include "gsfixer.h" // adds internals and implementation if it was first included without the implementation macro
 #include "gsfixer_traj.h"
 
-#include <time.h>
 
 #ifdef GSF_USE_EMBREE
 #ifndef GSF_EMBREE_INCLUDE
@@ -4399,11 +4398,6 @@ typedef struct gsf__discs { // the points as oriented discs, in tree order (neig
     uint8_t* oriented; // (count) 1: the normal points towards the views in the neighbours' tracks
 } gsf__discs;
 
-static double gsf__vis_seconds(void) { // for the statistics only
-    struct timespec t;
-    return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
-}
-
 #define GSF__VIS_ANY_DISC 1e-30f // less than any disc adds, yet positive: a cover of 0 reaches a limit of 0
 
 static gsf_visibility_desc gsf__visibility_desc_defaults(const gsf_visibility_desc* desc) {
@@ -5014,9 +5008,9 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
         for (int k = 0; k < 3; k++) job->centers[3 * i + (size_t)k] -= origin[k];
     }
 
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     GSF__TRY(gsf__discs_make(&job->arena, scene, origin, desc, &job->discs));
-    stats->seconds_normals = gsf__vis_seconds() - start;
+    stats->seconds_normals = gsf__seconds() - start;
     const size_t n = job->discs.count, chunks = (n + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
     job->seen = (uint8_t*)gsf__arena_alloc(&job->arena, n, 1);
     job->counts = (gsf__vis_counts*)gsf__arena_alloc_zeroed(&job->arena, chunks, sizeof *job->counts);
@@ -5039,14 +5033,14 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
 static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                    const gsf_visibility_desc* desc, uint8_t* keep, gsf_visibility_stats* stats) {
     gsf__vis_job job;
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     gsf_result result = gsf__vis_begin(ctx, scene, views, view_count, desc, keep, &job, stats);
 #ifdef GSF_USE_EMBREE
     if (result == GSF_OK && !desc->use_zbuffer) result = gsf__vis_by_embree(ctx, &job, stats);
 #endif
     if (result == GSF_OK && !stats->used_embree) result = gsf__vis_by_cells(ctx, &job);
     if (result == GSF_OK) {
-        stats->seconds_rays = gsf__vis_seconds() - start - stats->seconds_normals - stats->seconds_build;
+        stats->seconds_rays = gsf__seconds() - start - stats->seconds_normals - stats->seconds_build;
         for (size_t i = 0; i * GSF__VIS_CHUNK < job.discs.count; i++) {
             stats->rays += job.counts[i].rays;
             stats->culled += job.counts[i].culled;
@@ -5382,7 +5376,7 @@ static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
 
 // If Embree fails, logs a warning and leaves stats->used_embree 0.
 static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_visibility_stats* stats) {
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     int refused = 0;
     gsf_result result = GSF_OK;
     RTCScene scene = NULL;
@@ -5399,7 +5393,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
     }
     if (device && error == RTC_ERROR_NONE) {
         stats->used_embree = 1;
-        stats->seconds_build = gsf__vis_seconds() - start;
+        stats->seconds_build = gsf__seconds() - start;
         job->embree_scene = scene;
         result = gsf__embree_run(ctx, job);
     } else
@@ -6704,10 +6698,10 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     job->keep = keep;
     job->cost_fn = GSF__KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
     gsf__dense_make_window(&d, &job->window);
-    double start = gsf__vis_seconds();
+    double start = gsf__seconds();
     gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
     counted.views = job->view_count;
-    counted.seconds_prepare = gsf__vis_seconds() - start;
+    counted.seconds_prepare = gsf__seconds() - start;
     start += counted.seconds_prepare;
     int32_t levels = 1;
     for (; levels < d.levels; levels++) {
@@ -6720,12 +6714,12 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
         if (!fits) break;
     }
     if (result == GSF_OK && counted.pairs) result = gsf__dense_match(job, levels);
-    counted.seconds_match = gsf__vis_seconds() - start;
+    counted.seconds_match = gsf__seconds() - start;
     start += counted.seconds_match;
     gsf__arena arena = {ctx, NULL, 0};
     if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, &arena, out, &counted);
     out->owned = arena.last;
-    counted.seconds_fuse = gsf__vis_seconds() - start;
+    counted.seconds_fuse = gsf__seconds() - start;
     if (result == GSF_OK && !counted.pairs)
         gsf_log(ctx, GSF_LOG_WARNING, "dense points: none, because no two of the %zu views overlap", job->view_count);
     gsf__dense_free_level(job);
@@ -9719,12 +9713,12 @@ GSF__V_KERNEL int GSF__V(gsf__lazy_catch_up)(float* value, float* m, float* v, s
                                              const gsf__rest* rest) {
     const gsf__vf zero = gsf__v_set(0.0f), least = gsf__v_set(GSF__LAZY_LEAST_V);
     const size_t whole = n - n % GSF__LANES;
-    gsf__vm small = gsf__vm_of_bits(0);
+    gsf__vm tiny = gsf__vm_of_bits(0);
     for (size_t i = 0; i < n; i += GSF__LANES) {
         const gsf__vf mi = gsf__v_load_first(m + i, n - i), vi = gsf__v_load_first(v + i, n - i);
-        small = gsf__vm_or(small, gsf__vm_not(gsf__vm_or(gsf__v_eq(mi, zero), gsf__v_ge(vi, least))));
+        tiny = gsf__vm_or(tiny, gsf__vm_not(gsf__vm_or(gsf__v_eq(mi, zero), gsf__v_ge(vi, least))));
     }
-    if (gsf__vm_bits(small)) return 0;
+    if (gsf__vm_bits(tiny)) return 0;
     for (size_t i = 0; i < whole; i += GSF__LANES)
         GSF__V(gsf__lazy_vector)(value + i, m + i, v + i, rates + i, rest, GSF__LANES);
     if (whole < n) GSF__V(gsf__lazy_vector)(value + whole, m + whole, v + whole, rates + whole, rest, n - whole);
