@@ -1,0 +1,6 @@
+#!/usr/bin/env bash
+# wine.sh PROGRAM.exe ARGUMENT...: runs it without a display and without Wine's own messages. WINEPREFIX: see run.sh.
+export WINEDEBUG=${WINEDEBUG:--all} WINEDLLOVERRIDES="mscoree,mshtml,winemenubuilder.exe="
+unset DISPLAY WAYLAND_DISPLAY
+wine=$(command -v wine64 || ls /usr/lib/wine/wine64 2> /dev/null || command -v wine)
+exec "$wine" "$@"
