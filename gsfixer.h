@@ -1114,6 +1114,7 @@ GSF__SHARED gsf__carry_fn gsf__carry_fn_of(const gsf_restore_window* window) {
 
 // Result for the errno of a failed gsf__open_path. A path below a regular file (ENOTDIR) does not exist either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
+    if (reason == ENOMEM) return GSF_ERROR_OUT_OF_MEMORY;
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
 
@@ -1160,47 +1161,73 @@ GSF__SHARED int gsf__set_errno(DWORD reason) {
 
 enum { GSF__SHORT_PATH = 240 }; // in UTF-16 units; longer ones need the form \\?\, which no other program has to understand
 
-// A path for the W functions, freed with gsf_free; NULL if it is not UTF-8 or memory is out.
-GSF__SHARED wchar_t* gsf__wide_path(gsf_context* ctx, const char* path) {
+typedef struct gsf__wide { // a path for the W functions
+    wchar_t* text; // NULL: it is not UTF-8, or memory is out (errno)
+    wchar_t* owned;
+    wchar_t inside[GSF__SHORT_PATH + 1];
+} gsf__wide;
+
+GSF__SHARED void gsf__free_wide(gsf_context* ctx, gsf__wide* wide) { // keeps errno and the system's last error
+    const int reason = errno;
+    const DWORD last = GetLastError();
+    gsf_free(ctx, wide->owned);
+    SetLastError(last);
+    errno = reason;
+}
+
+// The absolute path in the form \\?\, after 8 units that the prefix may need.
+GSF__SHARED void gsf__lengthen_path(gsf_context* ctx, const wchar_t* path, gsf__wide* out) {
+    const DWORD room = GetFullPathNameW(path, 0, NULL, NULL); // with the zero
+    errno = ENOMEM;
+    out->owned = (wchar_t*)gsf_alloc(ctx, (size_t)room + 8, sizeof *out->owned);
+    const DWORD used = out->owned ? GetFullPathNameW(path, room, out->owned + 8, NULL) : 0;
+    if (used == 0 || used >= room) return;
+    const wchar_t* full = out->owned + 8;
+    const int network = full[0] == L'\\' && full[1] == L'\\'; // \\server\share becomes \\?\UNC\server\share
+    const size_t length = network ? 7 : 4;
+    memmove(out->owned + length, full + network, ((size_t)used + 1 - (size_t)network) * sizeof *full);
+    memcpy(out->owned, network ? L"\\\\?\\UNC" : L"\\\\?\\", length * sizeof *full);
+    out->text = out->owned;
+}
+
+GSF__SHARED void gsf__widen_path(gsf_context* ctx, const char* path, gsf__wide* out) { // end with gsf__free_wide
+    out->text = out->owned = NULL;
     const int size = MultiByteToWideChar(CP_UTF8, MB_ERR_INVALID_CHARS, path, -1, NULL, 0);
     errno = ENOENT; // no file can have such a name
-    if (size < 1) return NULL;
-    errno = ENOMEM;
-    wchar_t* wide = (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide);
-    if (!wide) return NULL;
+    if (size < 1) return;
+    wchar_t* long_path = NULL;
+    wchar_t* wide = out->inside;
+    if (size > GSF__SHORT_PATH) {
+        errno = ENOMEM;
+        wide = long_path = (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide);
+        if (!wide) return;
+    }
     MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, size);
     const int verbatim = wide[0] == L'\\' && wide[1] == L'\\' && (wide[2] == L'?' || wide[2] == L'.');
-    const DWORD room = verbatim ? 0 : GetFullPathNameW(wide, 0, NULL, NULL); // with the zero
-    if (room <= GSF__SHORT_PATH) return wide;
-    wchar_t* whole = (wchar_t*)gsf_alloc(ctx, (size_t)room + 8, sizeof *whole); // 8: of the longest prefix
-    const DWORD used = whole ? GetFullPathNameW(wide, room, whole + 8, NULL) : 0;
-    gsf_free(ctx, wide);
-    if (used == 0 || used >= room) {
-        gsf_free(ctx, whole);
-        return NULL;
+    if (verbatim || GetFullPathNameW(wide, 0, NULL, NULL) <= GSF__SHORT_PATH) { // a long one may become short: a/../b
+        out->text = wide;
+        out->owned = long_path;
+        return;
     }
-    const int network = whole[8] == L'\\' && whole[9] == L'\\'; // \\server\share becomes \\?\UNC\server\share
-    const wchar_t* prefix = network ? L"\\\\?\\UNC" : L"\\\\?\\";
-    const size_t length = network ? 7 : 4;
-    memcpy(whole, prefix, length * sizeof *whole);
-    memmove(whole + length, whole + 8 + network, ((size_t)used + 1 - (size_t)network) * sizeof *whole);
-    return whole;
+    gsf__lengthen_path(ctx, wide, out);
+    gsf_free(ctx, long_path);
 }
 
 GSF__SHARED gsf__path_kind gsf__look_at_path(gsf_context* ctx, const char* path) {
-    wchar_t* wide = gsf__wide_path(ctx, path);
-    if (!wide) return GSF__PATH_UNKNOWN;
-    const DWORD attributes = GetFileAttributesW(wide);
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
+    if (!wide.text) return gsf__free_wide(ctx, &wide), GSF__PATH_UNKNOWN;
+    const DWORD attributes = GetFileAttributesW(wide.text);
     gsf__path_kind kind = GSF__PATH_UNKNOWN;
     HANDLE file = INVALID_HANDLE_VALUE;
     if (attributes != INVALID_FILE_ATTRIBUTES && (attributes & FILE_ATTRIBUTE_DIRECTORY)) kind = GSF__PATH_FOLDER;
     else
-        file = CreateFileW(wide, 0, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, OPEN_EXISTING, 0, NULL);
+        file = CreateFileW(wide.text, 0, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, OPEN_EXISTING, 0, NULL);
     if (file != INVALID_HANDLE_VALUE) {
         kind = GetFileType(file) == FILE_TYPE_DISK ? GSF__PATH_FILE : GSF__PATH_DEVICE;
         CloseHandle(file);
     }
-    gsf_free(ctx, wide);
+    gsf__free_wide(ctx, &wide);
     return kind;
 }
 
@@ -1213,19 +1240,17 @@ GSF__SHARED int gsf__wait_for_path(int attempt) {
 
 // Others may read, replace and remove the file meanwhile, as on other platforms.
 GSF__SHARED HANDLE gsf__open_handle(gsf_context* ctx, const char* path, DWORD access, DWORD how, DWORD flags) {
-    wchar_t* wide = gsf__wide_path(ctx, path);
-    if (!wide) return INVALID_HANDLE_VALUE;
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
     HANDLE file = INVALID_HANDLE_VALUE;
-    for (int attempt = 0; file == INVALID_HANDLE_VALUE; attempt++) {
-        file = CreateFileW(wide, access, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, how, flags, NULL);
+    for (int attempt = 0; wide.text; attempt++) {
+        file = CreateFileW(wide.text, access, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, how, flags, NULL);
         const DWORD reason = GetLastError();
         if (file != INVALID_HANDLE_VALUE) break;
         gsf__set_errno(reason);
         if (reason != ERROR_SHARING_VIOLATION || !gsf__wait_for_path(attempt)) break;
     }
-    const int reason = errno;
-    gsf_free(ctx, wide);
-    errno = reason;
+    gsf__free_wide(ctx, &wide);
     return file;
 }
 
@@ -1243,29 +1268,30 @@ GSF__SHARED FILE* gsf__open_path(gsf_context* ctx, const char* path, gsf__open_m
 
 // A virus scanner or a reader of the old file makes it fail for a moment, in which the old file stays as it is.
 GSF__SHARED int gsf__replace_path(gsf_context* ctx, const char* from, const char* to) {
-    wchar_t *wide_from = gsf__wide_path(ctx, from), *wide_to = gsf__wide_path(ctx, to);
+    gsf__wide wide_from, wide_to;
+    gsf__widen_path(ctx, from, &wide_from);
+    gsf__widen_path(ctx, to, &wide_to);
     int result = -1;
-    for (int attempt = 0; wide_from && wide_to && result != 0; attempt++) {
-        if (MoveFileExW(wide_from, wide_to, MOVEFILE_REPLACE_EXISTING | MOVEFILE_WRITE_THROUGH)) result = 0;
+    for (int attempt = 0; wide_from.text && wide_to.text && result != 0; attempt++) {
+        if (MoveFileExW(wide_from.text, wide_to.text, MOVEFILE_REPLACE_EXISTING | MOVEFILE_WRITE_THROUGH)) result = 0;
         const DWORD reason = GetLastError();
         if (result == 0) break;
         gsf__set_errno(reason);
-        const DWORD there = GetFileAttributesW(wide_to); // a folder or a protected file will not give way
+        const DWORD there = GetFileAttributesW(wide_to.text); // a folder or a protected file will not give way
         const int lasting = there != INVALID_FILE_ATTRIBUTES && (there & (FILE_ATTRIBUTE_DIRECTORY | FILE_ATTRIBUTE_READONLY));
         if ((reason != ERROR_SHARING_VIOLATION && reason != ERROR_ACCESS_DENIED) || lasting || !gsf__wait_for_path(attempt))
             break;
     }
-    const int reason = errno;
-    gsf_free(ctx, wide_from);
-    gsf_free(ctx, wide_to);
-    errno = reason;
+    gsf__free_wide(ctx, &wide_from);
+    gsf__free_wide(ctx, &wide_to);
     return result;
 }
 
 GSF__SHARED void gsf__remove_path(gsf_context* ctx, const char* path) {
-    wchar_t* wide = gsf__wide_path(ctx, path);
-    if (wide) DeleteFileW(wide);
-    gsf_free(ctx, wide);
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
+    if (wide.text) DeleteFileW(wide.text);
+    gsf__free_wide(ctx, &wide);
 }
 
 #else

@@ -975,12 +975,14 @@ static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing
     gsf_buffer pattern;
     memset(&pattern, 0, sizeof pattern);
     gsf_append_text(ctx, &pattern, "%s/*", listing->folder);
-    wchar_t* wide = pattern.failed ? NULL : gsf__wide_path(ctx, pattern.data);
+    if (pattern.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__wide wide;
+    gsf__widen_path(ctx, pattern.data, &wide);
     WIN32_FIND_DATAW entry;
-    HANDLE folder = wide ? FindFirstFileW(wide, &entry) : INVALID_HANDLE_VALUE;
-    if (wide && folder == INVALID_HANDLE_VALUE) gsf__set_errno(GetLastError());
+    HANDLE folder = wide.text ? FindFirstFileW(wide.text, &entry) : INVALID_HANDLE_VALUE;
+    if (wide.text && folder == INVALID_HANDLE_VALUE) gsf__set_errno(GetLastError());
     const int reason = errno;
-    gsf_free(ctx, wide);
+    gsf__free_wide(ctx, &wide);
     gsf_destroy_buffer(ctx, &pattern);
     if (folder == INVALID_HANDLE_VALUE)
         return gsf_fail(ctx, gsf__open_result(reason), "%s: %s", listing->folder, strerror(reason));
@@ -2455,7 +2457,7 @@ GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const
     int found;
     if (kind != GSF__PATH_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
         result = gsf__nn_open_index_file(ctx, path, out);
-    } else if ((kind != GSF__PATH_FOLDER && kind != GSF__PATH_UNKNOWN) || (kind == GSF__PATH_UNKNOWN && gsf__nn_names_weights(path))) {
+    } else if (kind != GSF__PATH_FOLDER && (kind != GSF__PATH_UNKNOWN || gsf__nn_names_weights(path))) {
         result = gsf__nn_add_file(ctx, path, out);
         if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
     } else if (prefix) {
@@ -9830,22 +9832,22 @@ typedef struct gsf__caption_run {
 // Resizes the image as PIL does and normalizes it to floats (3, image_size, image_size).
 static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
     const int64_t side = net->image_size;
-    gsf_image coloured, small;
+    gsf_image coloured, little;
     memset(&coloured, 0, sizeof coloured);
-    memset(&small, 0, sizeof small);
+    memset(&little, 0, sizeof little);
     const int ready = image->dtype == GSF_U8 && image->channels == 3;
-    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &small);
+    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &little);
     if (!result && !ready) result = gsf_make_image(ctx, GSF_U8, image->width, image->height, 3, &coloured);
     if (!result && !ready) result = gsf_convert_image(ctx, image, &coloured);
-    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &small);
+    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &little);
     for (int64_t y = 0; y < side && !result; y++)
         for (int64_t x = 0; x < side; x++)
             for (int64_t c = 0; c < 3; c++) {
-                const uint8_t v = ((const uint8_t*)small.data)[(y * side + x) * 3 + c];
+                const uint8_t v = ((const uint8_t*)little.data)[(y * side + x) * 3 + c];
                 out[(c * side + y) * side + x] = ((float)((double)v * net->rescale) - net->mean[c]) / net->deviation[c];
             }
     gsf_destroy_image(ctx, &coloured);
-    gsf_destroy_image(ctx, &small);
+    gsf_destroy_image(ctx, &little);
     return result;
 }
 
@@ -15138,10 +15140,10 @@ static gsf_result gsf__mini_run_levels(gsf__mini_run* r) {
     for (int l = GSF__MINI_LEVELS - 2; l >= 0; l--) { // up; a 1x1 convolution may as well come before the upscaling
         const gsf__mini_level* net = &r->net->levels[l];
         const gsf__mini_planes *p = &r->levels[l], *below = p + 1;
-        float* small = p->a[GSF__MINI_BLOCKS]; // free until the block
+        float* little = p->a[GSF__MINI_BLOCKS]; // free until the block
         GSF__TRY(gsf__mini_convolve(r, &net->skip, p->x, r->batch, l, 0, 0, p->y));
-        GSF__TRY(gsf__mini_convolve(r, &net->below, below->y, r->batch, l + 1, 0, 0, small));
-        gsf__mini_scale_job job = {small, p->y, below->height, below->width, r->net->width[l]};
+        GSF__TRY(gsf__mini_convolve(r, &net->below, below->y, r->batch, l + 1, 0, 0, little));
+        gsf__mini_scale_job job = {little, p->y, below->height, below->width, r->net->width[l]};
         gsf__parallel_for(r->ctx, (size_t)(r->batch * p->height), gsf__mini_upscale_row, &job);
         GSF__TRY(gsf__mini_run_block(r, &net->out, l, GSF__MINI_BLOCKS, p->y));
         gsf__mini_relu(r, p->y, r->batch * p->height * p->width * r->net->width[l]);
@@ -16708,7 +16710,7 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
     const int64_t high = pair->pyramids[0][0].height, wide = pair->pyramids[0][0].width;
     const double down = (double)(1 << (3 - scale));
     const int64_t of_c = u->c1.weight->shape[0], of_f = u->f2.weight->shape[0], of_m = u->conv.weight->shape[0];
-    gsf__map corr, mix, flow1, input, hidden[2], small, delta;
+    gsf__map corr, mix, flow1, input, hidden[2], little, delta;
     const int room = net->room;
     GSF__TRY(gsf__amt_make(net, 1, high, wide, 2 * GSF__AMT_LOOKUP, &corr));
     GSF__TRY(gsf__amt_make(net, 1, high, wide, of_c + of_f, &mix));
@@ -16741,10 +16743,10 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
         const char* const names[2] = {"update.out1", "update.out0"};
         GSF__TRY(gsf__amt_make(net, 1, high, wide, head[0].weight->shape[0], &hidden[0]));
         GSF__TRY(gsf__amt_convolve_to(net, &head[0], 0.1f, &hidden[1], &hidden[0]));
-        GSF__TRY(gsf__amt_make(net, 1, high, wide, to->channels, &small));
-        GSF__TRY(gsf__amt_convolve_to(net, &head[1], 1.0f, &hidden[0], &small));
+        GSF__TRY(gsf__amt_make(net, 1, high, wide, to->channels, &little));
+        GSF__TRY(gsf__amt_convolve_to(net, &head[1], 1.0f, &hidden[0], &little));
         GSF__TRY(gsf__amt_make(net, 1, to->height, to->width, to->channels, &delta));
-        gsf__amt_resize(net, &small, down, i ? 1.0 : down, &delta);
+        gsf__amt_resize(net, &little, down, i ? 1.0 : down, &delta);
         gsf__amt_reveal(net, names[i], scale, &delta);
         gsf__amt_add(net, &delta, to);
     }

@@ -168,7 +168,8 @@ static gsf_result run_program(gsf_context* ctx, exec_state* e) {
     while (WaitForSingleObject(process.hProcess, 20) == WAIT_TIMEOUT && result == GSF_OK) {
         if (gsf_is_cancelled(ctx)) result = gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled");
         else if (gsfix_now() - begin > e->timeout)
-            result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped", e->command, e->timeout);
+            result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped", e->command,
+                              e->timeout);
     }
     DWORD status = 1;
     if (result == GSF_OK && GetExitCodeProcess(process.hProcess, &status) && status != 0)

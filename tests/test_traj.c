@@ -542,7 +542,8 @@ static void test_outliers(void) {
         const double direction[3] = {uniform(-1.0, 1.0), uniform(-1.0, 1.0), uniform(-1.0, 1.0)};
         desc.point_count = CURVE_POINTS;
         for (int k = 0; k < 4; k++) {
-            for (int i = 0; i < 3; i++) s.points[3 * (CURVE_POINTS - 1) + i] = remote[k] * (direction[i] + (direction[i] < 0 ? -1 : 1));
+            for (int i = 0; i < 3; i++)
+                s.points[3 * (CURVE_POINTS - 1) + i] = remote[k] * (direction[i] + (direction[i] < 0 ? -1 : 1));
             path with = sample(s.cameras, s.count, &desc);
             CHECK(with.result == without.result);
             double turned = 1.0;

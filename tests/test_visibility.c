@@ -90,10 +90,10 @@ static void test_neighbours(void) {
     double* points = (double*)malloc(many * 3 * sizeof(double));
     for (int kind = 0; kind < CLOUD_KINDS; kind++) {
         make_cloud(kind, many, points);
-        const double start = gsf__vis_seconds();
+        const double start = gsf__seconds();
         gsf__knn_tree tree;
         CHECK_OK(&ctx, gsf__knn_build(&ctx, points, many, NULL, &tree));
-        const double built = gsf__vis_seconds();
+        const double built = gsf__seconds();
         double sum = 0.0;
         for (size_t i = 0; i < many; i++) {
             double distance2[12];
@@ -103,7 +103,7 @@ static void test_neighbours(void) {
         }
         CHECK(isfinite(sum));
         printf("neighbours: cloud %d, %zu points: tree %.2f s, 12 nearest of all %.2f s\n", kind, many, built - start,
-               gsf__vis_seconds() - built);
+               gsf__seconds() - built);
         gsf__arena_free(&tree.arena);
     }
     free(points);
