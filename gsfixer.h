@@ -85,7 +85,7 @@
                         gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
-   SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
+   SECTIONS    >>glm >>internals >>maths >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
                >>images >>resize >>metrics >>cameras >>clips >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
@@ -1454,6 +1454,200 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == ctx->services->read_fn || ctx->io.plain_files;
 }
 
+// ---- >>maths: functions with the same bits everywhere -----------------------------
+
+/* The C libraries of Linux, Windows, Arm and the browsers differ in the last bits of exp, log, sin and so on, and glibc's in
+   those of machines with and without FMA. What a scene's training depends on is therefore computed here, by additions,
+   multiplications, divisions and sqrt, which IEEE 754 defines to the bit. Errors are below 1 ulp of double unless a comment says
+   otherwise; the rounding mode has to be the default (to nearest). */
+
+#define GSF__LN2_HIGH 0.693147180369123816490 // its last 32 bits are 0: a product with an exponent is exact
+#define GSF__LN2_LOW 1.90821492927058770002e-10
+#define GSF__TO_INT 6755399441055744.0        // 1.5 * 2^52: added and subtracted, it rounds to the nearest integer
+
+GSF__SHARED double gsf__power_of_2(int n) { // -1022 <= n <= 1023
+    const uint64_t bits = (uint64_t)(n + 1023) << 52;
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+// 1 + r + r^2/2 + ... for |r| <= ln(2)/2, without its first term.
+GSF__SHARED double gsf__exp_series(double r) {
+    double p = 1.0 / 6227020800.0;
+    p = p * r + 1.0 / 479001600.0;
+    p = p * r + 1.0 / 39916800.0;
+    p = p * r + 1.0 / 3628800.0;
+    p = p * r + 1.0 / 362880.0;
+    p = p * r + 1.0 / 40320.0;
+    p = p * r + 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    return p * r * r + r;
+}
+
+GSF__SHARED double gsf__exp_f64(double x) {
+    if (!(x < 710.0)) return x != x ? x : (double)INFINITY;
+    if (x < -746.0) return 0.0;
+    const double n = x * 1.44269504088896338700 + GSF__TO_INT - GSF__TO_INT;
+    const double high = x - n * GSF__LN2_HIGH, low = n * GSF__LN2_LOW, r = high - low;
+    const double p = 1.0 + (gsf__exp_series(r) + ((high - r) - low));
+    const int k = (int)n, half = k / 2;
+    return p * gsf__power_of_2(half) * gsf__power_of_2(k - half); // in two steps: 2^k may be subnormal
+}
+
+GSF__SHARED double gsf__expm1_f64(double x) {
+    return fabs(x) < 0.34 ? gsf__exp_series(x) : gsf__exp_f64(x) - 1.0;
+}
+
+// log(x + low), where low is negligible next to x but for the last bits.
+GSF__SHARED double gsf__log_sum(double x, double low) {
+    if (!(x > 0.0) || x > DBL_MAX) return x == 0.0 ? -(double)INFINITY : x > 0.0 || x != x ? x : (double)NAN;
+    int64_t bits;
+    int shift = 0;
+    if (x < DBL_MIN) x *= 18014398509481984.0, low *= 18014398509481984.0, shift = 54;
+    memcpy(&bits, &x, sizeof bits);
+    const int64_t k = (bits - 0x3fe6a09e667f3bcd) >> 52; // from sqrt(1/2): the mantissa ends up in [sqrt(1/2), sqrt(2))
+    bits -= k * ((int64_t)1 << 52);
+    double m;
+    memcpy(&m, &bits, sizeof m);
+    const double f = m - 1.0, n = (double)(k - shift), s = f / (2.0 + f), z = s * s; // log(m) = 2 artanh(s)
+    double p = 2.0 / 25.0;
+    p = p * z + 2.0 / 23.0;
+    p = p * z + 2.0 / 21.0;
+    p = p * z + 2.0 / 19.0;
+    p = p * z + 2.0 / 17.0;
+    p = p * z + 2.0 / 15.0;
+    p = p * z + 2.0 / 13.0;
+    p = p * z + 2.0 / 11.0;
+    p = p * z + 2.0 / 9.0;
+    p = p * z + 2.0 / 7.0;
+    p = p * z + 2.0 / 5.0;
+    p = p * z + 2.0 / 3.0;
+    const double half = 0.5 * f * f;
+    return n * GSF__LN2_HIGH - ((half - (s * (half + p * z) + (n * GSF__LN2_LOW + low / x))) - f);
+}
+
+GSF__SHARED double gsf__log_f64(double x) { return gsf__log_sum(x, 0.0); }
+
+GSF__SHARED double gsf__log1p_f64(double x) {
+    const double sum = 1.0 + x;
+    if (sum == 1.0) return x;
+    return gsf__log_sum(sum, fabs(x) < 1.0 ? x - (sum - 1.0) : 1.0 - (sum - x));
+}
+
+// x^n by squaring; the relative error grows with n, to n ulp at most.
+GSF__SHARED double gsf__power_f64(double x, uint64_t n) {
+    double power = 1.0;
+    for (; n; n >>= 1, x *= x)
+        if (n & 1u) power *= x;
+    return power;
+}
+
+// The multiple of pi/2 next to x, and the rest as a sum. Beyond a million the result is less exact than a double.
+GSF__SHARED int gsf__quadrant(double x, double* rest, double* low) {
+    const double n = x * 0.636619772367581382433 + GSF__TO_INT - GSF__TO_INT;
+    const double r = x - n * 1.57079632673412561417, w = n * 6.07710050630396597660e-11; // 33 bits each: exact
+    const double s = r - w, v = n * 2.02226624879595063154e-21 - ((r - s) - w);
+    *rest = s - v;
+    *low = (s - *rest) - v;
+    return (int)((int64_t)n & 3);
+}
+
+GSF__SHARED double gsf__sin_series(double x, double low) { // |x| <= pi/4
+    const double z = x * x;
+    double p = 1.0 / 355687428096000.0;
+    p = 1.0 / 1307674368000.0 - p * z;
+    p = 1.0 / 6227020800.0 - p * z;
+    p = 1.0 / 39916800.0 - p * z;
+    p = 1.0 / 362880.0 - p * z;
+    p = 1.0 / 5040.0 - p * z;
+    p = 1.0 / 120.0 - p * z;
+    p = 1.0 / 6.0 - p * z;
+    return x - (p * z * x - low * (1.0 - 0.5 * z));
+}
+
+GSF__SHARED double gsf__cos_series(double x, double low) { // |x| <= pi/4
+    const double z = x * x, half = 0.5 * z, rest = 1.0 - half;
+    double p = 1.0 / 6402373705728000.0;
+    p = 1.0 / 20922789888000.0 - p * z;
+    p = 1.0 / 87178291200.0 - p * z;
+    p = 1.0 / 479001600.0 - p * z;
+    p = 1.0 / 3628800.0 - p * z;
+    p = 1.0 / 40320.0 - p * z;
+    p = 1.0 / 720.0 - p * z;
+    p = 1.0 / 24.0 - p * z;
+    return rest + (((1.0 - rest) - half) + (p * z * z - x * low));
+}
+
+GSF__SHARED double gsf__turn(double x, int quarters) { // sin(x + quarters * pi/2)
+    double rest, low;
+    if (!(fabs(x) < 1e9)) return x != x || fabs(x) > DBL_MAX ? (double)NAN : 0.0;
+    const int quadrant = (gsf__quadrant(x, &rest, &low) + quarters) & 3;
+    const double value = quadrant & 1 ? gsf__cos_series(rest, low) : gsf__sin_series(rest, low);
+    return quadrant & 2 ? -value : value;
+}
+
+// Of arguments below 1e9, beyond which they have no use here (and are 0).
+GSF__SHARED double gsf__sin_f64(double x) { return gsf__turn(x, 0); }
+GSF__SHARED double gsf__cos_f64(double x) { return gsf__turn(x, 1); }
+GSF__SHARED double gsf__tan_f64(double x) { return gsf__turn(x, 0) / gsf__turn(x, 1); } // to 2 ulp
+
+GSF__SHARED double gsf__atan_unit(double x) { // 0 <= x <= 1; to 1.5 ulp
+    static const double centers[3] = {0.0, 0.5, 1.0};
+    static const double angles[3] = {0.0, 4.63647609000806093515e-01, 7.85398163397448278999e-01};
+    static const double rests[3] = {0.0, 2.26987774529616870924e-17, 3.06161699786838301793e-17};
+    const int k = x < 0.25 ? 0 : x < 0.75 ? 1 : 2;
+    const double t = (x - centers[k]) / (1.0 + x * centers[k]), z = t * t; // |t| <= 1/4
+    double p = 1.0 / 27.0;
+    for (int i = 25; i >= 3; i -= 2) p = 1.0 / (double)i - p * z;
+    return angles[k] + (t - (p * z * t - rests[k]));
+}
+
+GSF__SHARED double gsf__atan2_f64(double y, double x) { // to 2 ulp; 0 for two zeros
+    const double ax = fabs(x), ay = fabs(y), most = ax > ay ? ax : ay, least = ax > ay ? ay : ax;
+    if (x != x || y != y) return x + y;
+    double angle = most > 0.0 && least < (double)INFINITY ? gsf__atan_unit(least / most) : 0.0;
+    if (ay > ax) angle = 1.57079632679489655800 - (angle - 6.12323399573676603587e-17);
+    if (x < 0.0) angle = 3.14159265358979311600 - (angle - 1.2246467991473531772e-16);
+    return y < 0.0 ? -angle : angle;
+}
+
+GSF__SHARED double gsf__acos_f64(double x) { // to 3 ulp
+    return x != x ? x : 2.0 * gsf__atan2_f64(sqrt(x < 1.0 ? 1.0 - x : 0.0), sqrt(x > -1.0 ? 1.0 + x : 0.0));
+}
+
+GSF__SHARED double gsf__cbrt_f64(double x) { // to 2 ulp
+    if (!(fabs(x) > 0.0) || fabs(x) > DBL_MAX) return x;
+    const double a = fabs(x);
+    double root = gsf__exp_f64(gsf__log_f64(a) / 3.0);
+    root -= (root * root * root - a) / (3.0 * root * root);
+    return x < 0.0 ? -root : root;
+}
+
+// Of floats: rounded from double, and so nearly always correctly.
+GSF__SHARED float gsf__exp_f32(float x) { return (float)gsf__exp_f64((double)x); }
+GSF__SHARED float gsf__log_f32(float x) { return (float)gsf__log_f64((double)x); }
+
+GSF__SHARED float gsf__exp2_f32(float x) {
+    if (!(x < 128.0f)) return x != x ? x : INFINITY;
+    if (x < -150.0f) return 0.0f;
+    const double n = (double)x + GSF__TO_INT - GSF__TO_INT, r = ((double)x - n) * 0.69314718055994530942;
+    double p = 1.0 / 3628800.0; // to 1e-12: |r| <= ln(2)/2
+    p = p * r + 1.0 / 362880.0;
+    p = p * r + 1.0 / 40320.0;
+    p = p * r + 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    return (float)((p * r * r + r + 1.0) * gsf__power_of_2((int)n));
+}
+
 // ---- >>lanes: the vector vocabulary --------------------------------------------
 
 /* An elementwise kernel is written once, in terms of the names below, and compiled once per instruction set: its header
@@ -1979,7 +2173,7 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 
 #endif // GSF__X86
 
-// Powers, in terms of the vocabulary. The scalar versions, which have no FMA, call libm.
+// Powers, in terms of the vocabulary. The scalar versions, which have no FMA, go through double.
 
 #define gsf__v_exp2_terms GSF__V(gsf__v_exp2_terms)
 #define gsf__v_exp2_of GSF__V(gsf__v_exp2_of)
@@ -1988,8 +2182,8 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 #define gsf__v_exp2 GSF__V(gsf__v_exp2)
 #define gsf__v_exp GSF__V(gsf__v_exp)
 
-GSF__SHARED inline float gsf__v_exp2_scalar(float x) { return exp2f(x); }
-GSF__SHARED inline float gsf__v_exp_scalar(float x) { return expf(x); }
+GSF__SHARED inline float gsf__v_exp2_scalar(float x) { return gsf__exp2_f32(x); }
+GSF__SHARED inline float gsf__v_exp_scalar(float x) { return gsf__exp_f32(x); }
 
 GSF__END_IMPLEMENTATION
 
@@ -2232,7 +2426,7 @@ GSF_API double gsf_draw_uniform(uint64_t seed, uint64_t stream, uint64_t index) 
 GSF_API double gsf_draw_normal(uint64_t seed, uint64_t stream, uint64_t index) { // Box-Muller
     const double u = 1.0 - gsf_draw_uniform(seed, stream, 2 * index);
     const double v = gsf_draw_uniform(seed, stream, 2 * index + 1);
-    return sqrt(-2.0 * log(u)) * cos(6.283185307179586 * v);
+    return sqrt(-2.0 * gsf__log_f64(u)) * gsf__cos_f64(6.283185307179586 * v);
 }
 
 // ---- >>text --------------------------------------------------------------------
@@ -4046,7 +4240,7 @@ typedef struct gsf__resize_axis { // for each output position: taps first..first
 
 static double gsf__sinc(double x) {
     const double pi = 3.14159265358979323846;
-    return x == 0.0 ? 1.0 : sin(x * pi) / (x * pi);
+    return x == 0.0 ? 1.0 : gsf__sin_f64(x * pi) / (x * pi);
 }
 
 static double gsf__pil_filter(gsf_resize_filter filter, double x) {

@@ -1461,7 +1461,7 @@ static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* ba
 static void gsf__make_logits(float logits[256]) {
     for (int i = 0; i < 256; i++) {
         const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
-        logits[i] = (float)log(p / (1.0 - p));
+        logits[i] = (float)gsf__log_f64(p / (1.0 - p));
     }
 }
 
@@ -1637,7 +1637,7 @@ static unsigned char gsf__to_u8(float value) {
     return value >= 255.0f ? (unsigned char)255 : value > 0.0f ? (unsigned char)(value + 0.5f) : (unsigned char)0;
 }
 
-static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + expf(-logit)); }
+static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + gsf__exp_f32(-logit)); }
 
 // Normalises a quaternion. Zero becomes the identity, as in the rasterizer.
 static void gsf__unit_quat(const float* q, float out[4]) {
@@ -1725,7 +1725,7 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
         if (row % stride == 0) samples[n++] = (double)gsf__mean_log_scale(splats, i);
     }
     qsort(samples, n, sizeof samples[0], gsf__compare_doubles);
-    job->typical = n ? exp(samples[n / 2]) : 1.0;
+    job->typical = n ? gsf__exp_f64(samples[n / 2]) : 1.0;
     return GSF_OK;
 }
 
@@ -1768,7 +1768,7 @@ static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t k = 0; k < 3; k++) {
             const float scale = gsf__get_f32(row + 12 + 4 * k);
             bad |= gsf__float_is_bad(scale) | (scale < 0.0f);
-            s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
+            s->log_scales[3 * i + k] = gsf__log_f32(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
             s->sh[3 * i + k] = ((float)row[24 + k] / 255.0f - 0.5f) / gsf__dc_scale;
         }
         s->opacity_logits[i] = job->logits[row[27]];
@@ -1797,7 +1797,7 @@ static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         unsigned char* p = job->out + GSF__SPLAT_ROW * row;
         float q[4];
         for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, (float)(s->origin[k] + (double)s->means[3 * i + k]));
-        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, fminf(expf(s->log_scales[3 * i + k]), FLT_MAX));
+        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, fminf(gsf__exp_f32(s->log_scales[3 * i + k]), FLT_MAX));
         for (size_t k = 0; k < 3; k++) *p++ = gsf__to_u8((0.5f + gsf__dc_scale * s->sh[sh * i + k]) * 255.0f);
         *p++ = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
         gsf__unit_quat(s->quats + 4 * i, q);
@@ -3142,7 +3142,7 @@ static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
     r->lens = *lens;
     if (lens->kind == GSF__LENS_FOV) {
         const double omega = fabs(lens->k[0]);
-        r->lens.k[1] = omega < 1e-6 ? 1.0 : 2.0 * tan(0.5 * omega);
+        r->lens.k[1] = omega < 1e-6 ? 1.0 : 2.0 * gsf__tan_f64(0.5 * omega);
         r->lens.k[2] = omega < 1e-6 ? 1.0 : r->lens.k[1] / omega;
         if (omega < 1e-6) r->lens.kind = GSF__LENS_PINHOLE;
     }
@@ -3369,8 +3369,8 @@ static int gsf__camera_lens(const gsf__sfm_camera* camera, int64_t width, int64_
         out->width = (int32_t)width;
         out->height = (int32_t)height;
     }
-    if (!(out->fx > 0.0)) out->fx = 0.5 * out->width / tan(0.5 * camera->angle_x);
-    if (!(out->fy > 0.0)) out->fy = camera->angle_y > 0.0 ? 0.5 * out->height / tan(0.5 * camera->angle_y) : out->fx;
+    if (!(out->fx > 0.0)) out->fx = 0.5 * out->width / gsf__tan_f64(0.5 * camera->angle_x);
+    if (!(out->fy > 0.0)) out->fy = camera->angle_y > 0.0 ? 0.5 * out->height / gsf__tan_f64(0.5 * camera->angle_y) : out->fx;
     if (isnan(out->cx)) out->cx = 0.5 * out->width;
     if (isnan(out->cy)) out->cy = 0.5 * out->height;
     return isfinite(out->fx) && isfinite(out->fy) && out->fx > 0.0 && out->fy > 0.0;
@@ -3819,7 +3819,7 @@ static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r,
 static void gsf__encode_srgb(float* values, size_t count) {
     for (size_t i = 0; i < count; i++) {
         const float v = values[i];
-        values[i] = v <= 0.0031308f ? 12.92f * v : 1.055f * powf(v, 1.0f / 2.4f) - 0.055f;
+        values[i] = v <= 0.0031308f ? 12.92f * v : 1.055f * (float)gsf__exp_f64(gsf__log_f64((double)v) / 2.4) - 0.055f;
     }
 }
 
@@ -4332,7 +4332,7 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
         double mean = 0.0;
         for (int k = 0; k < found; k++) mean += distance2[k];
         if (found) mean /= found;
-        job->log_scales[i] = (float)(0.5 * log(mean > 1e-7 ? mean : 1e-7));
+        job->log_scales[i] = (float)(0.5 * gsf__log_f64(mean > 1e-7 ? mean : 1e-7));
     }
 }
 
@@ -4760,8 +4760,8 @@ static void gsf__vis_likelihoods(gsf__vis_job* job) {
         }
         double p = (finds + 1.0) / (tries + 20.0);
         p = p < 0.02 ? 0.02 : p > 0.95 ? 0.95 : p;
-        job->found[b] = log(p / wrong);
-        job->missed[b] = log((1.0 - p) / (1.0 - wrong));
+        job->found[b] = gsf__log_f64(p / wrong);
+        job->missed[b] = gsf__log_f64((1.0 - p) / (1.0 - wrong));
     }
 }
 
@@ -5688,10 +5688,10 @@ static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* w
             window->dx[window->count] = (float)dx;
             window->dy[window->count] = (float)dy;
             window->spatial[window->count++] =
-                (float)exp(-(double)(dx * dx + dy * dy) / (2.0 * (double)d->radius * (double)d->radius));
+                (float)gsf__exp_f64(-(double)(dx * dx + dy * dy) / (2.0 * (double)d->radius * (double)d->radius));
         }
     window->count = (window->count + 7) / 8 * 8;
-    for (int i = 0; i < 256; i++) window->tonal[i] = (float)exp(-(double)i / (double)d->color_sigma);
+    for (int i = 0; i < 256; i++) window->tonal[i] = (float)gsf__exp_f64(-(double)i / (double)d->color_sigma);
 }
 
 // Returns 0 if the window has too little texture to match.
@@ -6120,7 +6120,7 @@ static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, co
     gsf_get_camera_center(a, ca);
     gsf_get_camera_center(b, cb);
     const double c = gsf__ray_cosine(point, ca, cb);
-    const double degrees = acos(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
+    const double degrees = gsf__acos_f64(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
     if (!(degrees >= (double)job->desc.min_angle)) return 0.0;
     const double off = (degrees - 10.0) / (degrees < 10.0 ? 4.0 : 20.0), scale = a->fx / depth_a / (b->fx / depth_b);
     return (scale < 1.0 ? scale : 1.0 / scale) / (1.0 + off * off);
@@ -6607,7 +6607,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf__arena* arena, gsf_de
     size_t starts[BINS + 1], count = 0, n = 0;
     job->links = (uint8_t*)gsf__arena_alloc(&job->level_arena, job->pixel_count, 1);
     if (!job->links) return GSF_ERROR_OUT_OF_MEMORY;
-    job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
+    job->min_normal_dot = (float)gsf__cos_f64((double)job->desc.max_normal_angle * 0.017453292519943295);
     gsf__dense_hide(job);
     gsf__dense_run(job, gsf__dense_link);
     memset(starts, 0, sizeof starts);
@@ -9574,10 +9574,10 @@ static double gsf__exponential_rate(int32_t step, double first, double last, int
     double delay = 1.0;
     if (delay_steps > 0) {
         const double u = step < delay_steps ? (double)step / delay_steps : 1.0;
-        delay = delay_factor + (1.0 - delay_factor) * sin(1.5707963267948966 * u);
+        delay = delay_factor + (1.0 - delay_factor) * gsf__sin_f64(1.5707963267948966 * u);
     }
     const double t = step < max_steps ? (double)step / max_steps : 1.0;
-    return delay * exp(log(first) * (1.0 - t) + log(last) * t);
+    return delay * gsf__exp_f64(gsf__log_f64(first) * (1.0 - t) + gsf__log_f64(last) * t);
 }
 
 typedef struct gsf__adam_rates { // learning rates of one step
@@ -9738,7 +9738,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->catch_up = GSF__WIDE_KERNEL_OF(level, gsf__lazy_catch_up);
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
     const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
-    double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
+    double power1 = gsf__power_f64(0.9, (uint64_t)t), power2 = gsf__power_f64(0.999, (uint64_t)t);
+    double decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
     for (int32_t n = 1; n <= GSF__REST_MOST && n <= t; n++) {
         gsf__rest* rest = &lazy->rests[n];
         const double c1 = 1.0 - power1, c2 = sqrt(1.0 - power2);
@@ -9861,8 +9862,8 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     gsf__adam_job job;
     memset(&job, 0, sizeof job);
     job.model = model;
-    const double correction1 = 1.0 - pow(0.9, t);
-    job.inv_correction2 = (float)(1.0 / sqrt(1.0 - pow(0.999, t)));
+    const double correction1 = 1.0 - gsf__power_f64(0.9, (uint64_t)t);
+    job.inv_correction2 = (float)(1.0 / sqrt(1.0 - gsf__power_f64(0.999, (uint64_t)t)));
     job.rates[GSF__MEANS] = (float)(rates->means / correction1);
     job.rates[GSF__SCALES] = (float)(rates->scales / correction1);
     job.rates[GSF__QUATS] = (float)(rates->quats / correction1);
@@ -9949,7 +9950,7 @@ static float gsf__densify_cap(const gsf__model* model, float threshold, size_t r
 // Sets model->action of every splat and counts clones and splits. If max_splats leaves no room for all candidates,
 // those with the largest gradients are taken.
 static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule* rule, size_t* clones, size_t* splits) {
-    const float clone_log = (float)log(rule->clone_scale);
+    const float clone_log = (float)gsf__log_f64(rule->clone_scale);
     float threshold = rule->grad;
     const size_t room = rule->max_splats > model->count ? rule->max_splats - model->count : 0;
     *clones = *splits = 0;
@@ -10017,7 +10018,7 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
     gsf__model_copy_row(model, parent, child);
     float* scale = model->groups[GSF__SCALES].value + 3 * child;
     double offset[3];
-    for (int a = 0; a < 3; a++) offset[a] = exp((double)scale[a]) * normal[a];
+    for (int a = 0; a < 3; a++) offset[a] = gsf__exp_f64((double)scale[a]) * normal[a];
     gsf__densify_move(model, child, offset);
     for (int a = 0; a < 3; a++) scale[a] -= 0.47000363f; // log(1.6)
 }
@@ -10025,8 +10026,8 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
 // Gives a splat of opacity o the opacity 1 - sqrt(1 - o), of which two are as opaque as it was.
 static void gsf__densify_share(gsf__model* model, size_t i) {
     float* logit = model->groups[GSF__OPACITY].value + i;
-    const double clear = 1.0 / (1.0 + exp((double)*logit)), each = sqrt(clear > 1e-12 ? clear : 1e-12);
-    *logit = (float)(log1p(-each) - log(each));
+    const double clear = 1.0 / (1.0 + gsf__exp_f64((double)*logit)), each = sqrt(clear > 1e-12 ? clear : 1e-12);
+    *logit = (float)(gsf__log1p_f64(-each) - gsf__log_f64(each));
 }
 
 // One of the two parts of a splat with a shared opacity. side: -1 or 1.
@@ -10035,7 +10036,7 @@ static void gsf__densify_part(gsf__model* model, size_t parent, size_t child, do
     gsf__model_copy_row(model, parent, child);
     float* scale = model->groups[GSF__SCALES].value + 3 * child + longest;
     double offset[3] = {0.0, 0.0, 0.0};
-    offset[longest] = side * 0.5 * exp((double)*scale);
+    offset[longest] = side * 0.5 * gsf__exp_f64((double)*scale);
     gsf__densify_move(model, child, offset);
     *scale -= 0.41551544f; // log(0.66)
     gsf__densify_share(model, child);
@@ -10043,8 +10044,8 @@ static void gsf__densify_part(gsf__model* model, size_t parent, size_t child, do
 
 // Removes split parents and the splats to be pruned; the order of the others is kept. Resets the statistics.
 static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rule) {
-    const float opacity_logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
-    const float scale_log = rule->prune_scale > 0.0 ? (float)log(rule->prune_scale) : FLT_MAX;
+    const float opacity_logit = (float)gsf__log_f64(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const float scale_log = rule->prune_scale > 0.0 ? (float)gsf__log_f64(rule->prune_scale) : FLT_MAX;
     gsf__column columns[GSF__COLUMNS];
     gsf__model_columns(model, columns);
     size_t kept = 0;
@@ -10101,7 +10102,7 @@ enum { GSF__MCMC_MOST = 51 }; // N is clamped to this, as in gsplat
 // double is below 1e-12.
 static double gsf__mcmc_share(double transparency, uint32_t copies, double* opacity) {
     double term = 1.0, sum = 0.0;
-    *opacity = -expm1(log(transparency) / (double)copies);
+    *opacity = -gsf__expm1_f64(gsf__log_f64(transparency) / (double)copies);
     for (uint32_t j = 1; j <= copies; j++) {
         term *= -*opacity * (double)(copies - j + 1) / (double)j;
         sum -= term / sqrt((double)j);
@@ -10142,12 +10143,12 @@ static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
         if (model->visits[0][i] == 0) continue;
         float *logit = model->groups[GSF__OPACITY].value + i, *scale = model->groups[GSF__SCALES].value + 3 * i;
         const uint32_t most = GSF__MCMC_MOST, copies = model->visits[0][i] < most ? model->visits[0][i] + 1 : most;
-        const double clear = 1.0 / (1.0 + exp((double)*logit));
+        const double clear = 1.0 / (1.0 + gsf__exp_f64((double)*logit));
         double opacity;
-        const float grown = (float)log(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
+        const float grown = (float)gsf__log_f64(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
                                                        &opacity));
         if (opacity < least_opacity) opacity = least_opacity;
-        *logit = (float)log(opacity / (1.0 - opacity));
+        *logit = (float)gsf__log_f64(opacity / (1.0 - opacity));
         for (int a = 0; a < 3; a++) scale[a] += grown;
         gsf__model_clear_moments(model, i);
     }
@@ -10172,7 +10173,7 @@ static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, f
 
 // Needs capacity for the splats that gsf__mcmc_growth adds.
 static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) {
-    const float logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const float logit = (float)gsf__log_f64(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const size_t count = model->count;
     size_t dead = 0;
     for (size_t i = 0; i < count; i++) dead += model->groups[GSF__OPACITY].value[i] < logit;
@@ -10183,7 +10184,7 @@ static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) 
 
 // Lowers opacities above `limit` to it and zeroes the moments of all opacities.
 static void gsf__reset_opacity(gsf__model* model, double limit) {
-    const float logit = (float)log(limit / (1.0 - limit));
+    const float logit = (float)gsf__log_f64(limit / (1.0 - limit));
     gsf__group* group = &model->groups[GSF__OPACITY];
     for (size_t i = 0; i < model->count; i++)
         if (group->value[i] > logit) group->value[i] = logit;
@@ -10846,7 +10847,7 @@ static void gsf__decay_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t end = gsf__model_chunk_end(count, chunk);
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
         if (logits[i] > -30.0f) // lower ones are invisible anyway
-            logits[i] = (float)(log(job->factor) - log(exp(-(double)logits[i]) + 1.0 - job->factor));
+            logits[i] = (float)(gsf__log_f64(job->factor) - gsf__log_f64(gsf__exp_f64(-(double)logits[i]) + 1.0 - job->factor));
 }
 
 static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are gradient statistics needed?
@@ -11049,7 +11050,7 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
     if (d->opacity_decay > 0.0f && iteration % GSF__DECAY_INTERVAL == 0) {
         gsf__decay_job job;
         job.model = model;
-        job.factor = pow(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
+        job.factor = gsf__power_f64(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
         gsf__parallel_for(ctx, chunks, gsf__decay_chunk, &job);
     }
     if (d->mcmc && d->mcmc_noise > 0.0f) {
@@ -11651,10 +11652,10 @@ static void gsf__carry_fit(gsf__carrier* carrier, const gsf__carry_pairs* pairs,
         const double gain = (at * bb - bt * ab) / det, shift = (aa * bt - ab * at) / det;
         study->gain[channel] += 0.5f * ((float)(gain < 0.25 ? 0.25 : gain > 4.0 ? 4.0 : gain) - study->gain[channel]);
         study->offset[channel] += 0.5f * ((float)shift - study->offset[channel]);
-        log_gain += log((double)study->gain[channel]) / carrier->study_count;
+        log_gain += gsf__log_f64((double)study->gain[channel]) / carrier->study_count;
         offset += (double)study->offset[channel] / carrier->study_count;
     }
-    const float scale = (float)exp(-log_gain);
+    const float scale = (float)gsf__exp_f64(-log_gain);
     for (int32_t i = 0; i < carrier->study_count; i++) {
         carrier->studies[i].gain[channel] *= scale;
         carrier->studies[i].offset[channel] = (carrier->studies[i].offset[channel] - (float)offset) * scale;
@@ -13557,7 +13558,7 @@ static void gsf__random_point(const gsf_scene_view* view, const double* focus, u
     gsf_get_camera_c2w(camera, c2w);
     if (!focus || !gsf_project_point(camera, focus, &x, &y, &depth)) depth = 1.0;
     const double least = 0.3 * depth, most = 2.0 * depth, a = least * least * least;
-    const double z = cbrt(a + (most * most * most - a) * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i));
+    const double z = gsf__cbrt_f64(a + (most * most * most - a) * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i));
     const double u = camera->width * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 1);
     const double v = camera->height * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 2);
     x = (u - camera->cx) / camera->fx * z;

@@ -1,8 +1,8 @@
 // The headers after names that platforms' headers define as macros: none of them is an identifier of ours. On Windows, after
 // the platform's own.
 #ifdef _WIN32
-#include <windows.h> // whole: with rpcndr.h, wingdi.h and min, max
 #include <winsock2.h>
+#include <windows.h> // whole: with rpcndr.h, wingdi.h and min, max
 #else
 #define small char
 #define near
