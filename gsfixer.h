@@ -160,6 +160,7 @@ typedef enum gsf_cpu_level { // instruction sets that kernels may use; AUTO sele
     GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
     GSF_CPU_AVX512_VNNI = 4, // AVX512 and 8-bit dot products
     GSF_CPU_AVX512_BF16 = 5, // AVX512_VNNI and bfloat16 dot products
+    GSF_CPU_SIMD128 = 6,     // four lanes: NEON of 64-bit Arm, SIMD128 of WebAssembly (which is chosen when compiling)
 } gsf_cpu_level;
 
 typedef enum gsf_log_level { GSF_LOG_ERROR = 0, GSF_LOG_WARNING = 1, GSF_LOG_INFO = 2 } gsf_log_level;
@@ -225,7 +226,7 @@ GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
 GSF_API int32_t gsf_is_cancelled(const gsf_context* ctx);
 
-// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16").
+// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16", "simd128").
 GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
@@ -666,6 +667,20 @@ __asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
 #define GSF__INLINE_BF16 GSF__TARGET_BF16 GSF__ALWAYS_INLINE static inline
 #else
 #define GSF__X86 0
+#endif
+
+// Four lanes: NEON of 64-bit Arm, which always has it, or SIMD128 of WebAssembly (-msimd128).
+#if !defined(GSF_NO_SIMD) && defined(__aarch64__) && (defined(__GNUC__) || defined(__clang__))
+#define GSF__SIMD128 1
+#define GSF__NEON 1
+#include <arm_neon.h>
+#elif !defined(GSF_NO_SIMD) && defined(__wasm_simd128__)
+#define GSF__SIMD128 1
+#define GSF__NEON 0
+#include <wasm_simd128.h>
+#else
+#define GSF__SIMD128 0
+#define GSF__NEON 0
 #endif
 
 #ifdef _OPENMP
@@ -1659,6 +1674,7 @@ GSF__SHARED float gsf__exp2_f32(float x) {
        #define GSF__KERNELS "gsfixer_x.h"       // the file with the kernels
        #define GSF__KERNELS_BLUR                // the section to compile
        #define GSF__KERNELS_AVX512              // optional: compile a 16-lane copy, too
+       #define GSF__KERNELS_SIMD128             // optional: compile a 4-lane copy for Arm and WebAssembly
        #include "gsfixer.h"                     // includes gsfixer_x.h once per instruction set
        #undef GSF__KERNELS_BLUR
        #endif
@@ -1676,7 +1692,8 @@ GSF__SHARED float gsf__exp2_f32(float x) {
    Names       gsf__v_ operates on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the other types. + - * / work on gsf__vf and
                gsf__vd, which are plain float and double or vector types for which GCC and Clang define operators (another
                compiler would need C++ overloads). No other vector extension is used.
-   madd        a * b + c; msub: a * b - c; nmadd: c - a * b. Fused, except in the scalar version.
+   madd        a * b + c; msub: a * b - c; nmadd: c - a * b. Fused if GSF__FUSED, that is, except in the scalar version and on
+               WebAssembly, which has no such instruction.
    min, max    return b if either operand is a NaN: max(limit, x) propagates a NaN in x, max(x, limit) replaces it.
    _first      reads or writes only the first n lanes (all if n >= GSF__LANES); other lanes are loaded as 0.
    sum         adds the upper half to the lower until one lane is left; 8 lanes: ((0+4)+(2+6)) + ((1+5)+(3+7)).
@@ -1691,15 +1708,23 @@ GSF__SHARED float gsf__exp2_f32(float x) {
 #define GSF__V_INLINE GSF__V(GSF__V_INLINE)        // begins the definition of a function to be inlined into kernels
 #define GSF__LANES GSF__V(GSF__LANES)
 #define GSF__HALVES GSF__V(GSF__HALVES)
+#define GSF__FUSED GSF__V(GSF__FUSED)
 
-// The copy of a kernel, or of a constant, for a CPU level; WIDE: of one that has an AVX-512 copy.
+// The copy of a kernel, or of a constant, for a CPU level; LANE: of one that has a 4-lane copy; WIDE: of one that also has an
+// AVX-512 copy.
 #if GSF__X86
 #define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__WIDE_KERNEL_OF(level, name) \
     ((level) >= GSF_CPU_AVX512 ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
+#define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
+#elif GSF__SIMD128
+#define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
+#define GSF__WIDE_KERNEL_OF GSF__LANE_KERNEL_OF
+#define GSF__LANE_KERNEL_OF(level, name) ((level) == GSF_CPU_SIMD128 ? name##_simd128 : name##_scalar)
 #else
 #define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
 #define GSF__WIDE_KERNEL_OF GSF__KERNEL_OF
+#define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
 #endif
 
 #define gsf__vf GSF__V(gsf__vf)
@@ -1780,6 +1805,7 @@ GSF__SHARED float gsf__exp2_f32(float x) {
 
 #define GSF__LANES_scalar 1
 #define GSF__HALVES_scalar 1
+#define GSF__FUSED_scalar 0
 #define GSF__V_KERNEL_scalar
 #define GSF__V_INLINE_scalar GSF__ALWAYS_INLINE GSF__SHARED inline
 
@@ -1879,6 +1905,7 @@ GSF__SHARED inline double gsf__vd_sum_scalar(double x) { return x; }
 
 #define GSF__LANES_avx2 8
 #define GSF__HALVES_avx2 2
+#define GSF__FUSED_avx2 1
 #define GSF__V_KERNEL_avx2 GSF__TARGET_AVX2
 #define GSF__V_INLINE_avx2 GSF__INLINE_AVX2
 
@@ -2029,6 +2056,7 @@ GSF__INLINE_AVX2 double gsf__vd_sum_avx2(__m256d v) {
 
 #define GSF__LANES_avx512 16
 #define GSF__HALVES_avx512 2
+#define GSF__FUSED_avx512 1
 #define GSF__V_KERNEL_avx512 GSF__TARGET_AVX512
 #define GSF__V_INLINE_avx512 GSF__INLINE_AVX512
 
@@ -2173,6 +2201,284 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 
 #endif // GSF__X86
 
+#if GSF__SIMD128
+
+// Four lanes, in terms of GCC's and Clang's vectors where their operators do the same on all processors.
+
+#define GSF__LANES_simd128 4
+#define GSF__HALVES_simd128 2
+#define GSF__FUSED_simd128 GSF__NEON
+#define GSF__V_KERNEL_simd128
+#define GSF__V_INLINE_simd128 GSF__ALWAYS_INLINE GSF__SHARED inline
+#define GSF__INLINE_SIMD128 GSF__V_INLINE_simd128
+
+#if GSF__NEON
+typedef float32x4_t gsf__vf_simd128;
+typedef int32x4_t gsf__vi_simd128;
+typedef float64x2_t gsf__vd_simd128;
+#else
+typedef float gsf__vf_simd128 __attribute__((vector_size(16)));
+typedef int32_t gsf__vi_simd128 __attribute__((vector_size(16)));
+typedef double gsf__vd_simd128 __attribute__((vector_size(16)));
+#endif
+typedef gsf__vi_simd128 gsf__vm_simd128; // each lane has all bits set or none
+typedef uint32_t gsf__vu_simd128 __attribute__((vector_size(16)));
+
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_set_simd128(int32_t x) {
+    const gsf__vi_simd128 v = {x, x, x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_index_simd128(void) {
+    const gsf__vi_simd128 v = {0, 1, 2, 3};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_load_simd128(const int32_t* p) {
+    gsf__vi_simd128 v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__vi_store_simd128(int32_t* p, gsf__vi_simd128 x) { memcpy(p, &x, sizeof x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_gather_simd128(const uint32_t* p, gsf__vi_simd128 i) {
+    const gsf__vi_simd128 v = {(int32_t)p[i[0]], (int32_t)p[i[1]], (int32_t)p[i[2]], (int32_t)p[i[3]]};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_byte_simd128(gsf__vi_simd128 x, int k) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)x >> (uint32_t)(8 * k) & 255u);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_add_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a + (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_sub_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a - (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_mul_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a * (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_shl_simd128(gsf__vi_simd128 x, int by) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)x << (uint32_t)by);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_sar_simd128(gsf__vi_simd128 x, int by) { return x >> by; }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_keep_simd128(gsf__vm_simd128 mask, gsf__vi_simd128 x) { return mask & x; }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_as_floats_simd128(gsf__vi_simd128 bits) { return (gsf__vf_simd128)bits; }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_bits_simd128(gsf__vf_simd128 x) { return (gsf__vi_simd128)x; }
+
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_first_simd128(size_t n) {
+    return (gsf__vm_simd128)(gsf__vi_index_simd128() < gsf__vi_set_simd128(n < 4 ? (int32_t)n : 4));
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_of_bits_simd128(uint32_t bits) {
+    const gsf__vi_simd128 bit = {1, 2, 4, 8};
+    return (gsf__vm_simd128)((gsf__vi_set_simd128((int32_t)bits) & bit) == bit);
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_and_simd128(gsf__vm_simd128 a, gsf__vm_simd128 b) { return a & b; }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_or_simd128(gsf__vm_simd128 a, gsf__vm_simd128 b) { return a | b; }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_not_simd128(gsf__vm_simd128 mask) { return ~mask; }
+
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_set_simd128(float x) {
+    const gsf__vf_simd128 v = {x, x, x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_simd128(const float* p) {
+    gsf__vf_simd128 v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__v_store_simd128(float* p, gsf__vf_simd128 x) { memcpy(p, &x, sizeof x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_first_simd128(const float* p, size_t n) {
+    if (n >= 4) return gsf__v_load_simd128(p);
+    const gsf__vf_simd128 v = {n > 0 ? p[0] : 0.0f, n > 1 ? p[1] : 0.0f, n > 2 ? p[2] : 0.0f, 0.0f};
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__v_store_first_simd128(float* p, gsf__vf_simd128 x, size_t n) {
+    if (n >= 4) {
+        gsf__v_store_simd128(p, x);
+        return;
+    }
+    if (n > 0) p[0] = x[0];
+    if (n > 1) p[1] = x[1];
+    if (n > 2) p[2] = x[2];
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_gather_simd128(const float* p, gsf__vi_simd128 i) {
+    const gsf__vf_simd128 v = {p[i[0]], p[i[1]], p[i[2]], p[i[3]]};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_bytes_simd128(const uint8_t* p, size_t n) {
+    const gsf__vf_simd128 v = {n > 0 ? (float)p[0] : 0.0f, n > 1 ? (float)p[1] : 0.0f, n > 2 ? (float)p[2] : 0.0f,
+                               n > 3 ? (float)p[3] : 0.0f};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_eq_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a == b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_lt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a < b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_le_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a <= b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_gt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a > b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_ge_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a >= b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_keep_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)(mask & (gsf__vi_simd128)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_abs_simd128(gsf__vf_simd128 x) {
+    return gsf__v_keep_simd128(gsf__vi_set_simd128(0x7fffffff), x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_with_sign_simd128(gsf__vf_simd128 x, gsf__vf_simd128 of) {
+    return (gsf__vf_simd128)((gsf__vi_simd128)x ^ ((gsf__vi_simd128)of & gsf__vi_set_simd128(-0x7fffffff - 1)));
+}
+GSF__INLINE_SIMD128 void gsf__v_pin_simd128(gsf__vf_simd128* v) { (void)v; }
+GSF__INLINE_SIMD128 void gsf__v_fetch_simd128(const float* p) { __builtin_prefetch(p); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_set_simd128(double x) {
+    const gsf__vd_simd128 v = {x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 double gsf__vd_sum_simd128(gsf__vd_simd128 x) { return x[0] + x[1]; }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_load_simd128(const float* p) {
+    const gsf__vd_simd128 v = {(double)p[0], (double)p[1]};
+    return v;
+}
+
+#if GSF__NEON
+
+GSF__INLINE_SIMD128 uint32_t gsf__vm_bits_simd128(gsf__vm_simd128 mask) {
+    const uint32x4_t bit = {1, 2, 4, 8};
+    return vaddvq_u32(vandq_u32(vreinterpretq_u32_s32(mask), bit));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_madd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmaq_f32(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_msub_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmaq_f32(vnegq_f32(c), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_nmadd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmsq_f32(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_select_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 yes, gsf__vf_simd128 no) {
+    return vbslq_f32(vreinterpretq_u32_s32(mask), yes, no);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_min_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return vbslq_f32(vcltq_f32(a, b), a, b); // Arm's own minimum propagates a NaN in either operand
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_max_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return vbslq_f32(vcgtq_f32(a, b), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) { return vsqrtq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) { return vrndnq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) { return vrndmq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) { return vrndpq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_to_int_simd128(gsf__vf_simd128 x) { return vcvtnq_s32_f32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_truncate_simd128(gsf__vf_simd128 x) { return vcvtq_s32_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_floats_simd128(gsf__vi_simd128 x) { return vcvtq_f32_s32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_min_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) { return vminq_s32(a, b); }
+GSF__INLINE_SIMD128 float gsf__v_sum_simd128(gsf__vf_simd128 v) {
+    return vaddv_f32(vadd_f32(vget_low_f32(v), vget_high_f32(v)));
+}
+GSF__INLINE_SIMD128 float gsf__v_largest_simd128(gsf__vf_simd128 v) { return vmaxvq_f32(v); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_low_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vzip1q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_high_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vzip2q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_half_simd128(gsf__vf_simd128 v, int h) {
+    return h ? vcvt_high_f64_f32(v) : vcvt_f64_f32(vget_low_f32(v));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vd_floats_simd128(const gsf__vd_simd128 halves[2]) {
+    return vcvt_high_f32_f64(vcvt_f32_f64(halves[0]), halves[1]);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_madd_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b, gsf__vd_simd128 c) {
+    return vfmaq_f64(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) { return vsqrtq_f64(x); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_max_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b) {
+    return vbslq_f64(vcgtq_f64(a, b), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_keep_above_simd128(gsf__vd_simd128 a, gsf__vd_simd128 limit, gsf__vd_simd128 x) {
+    return vbslq_f64(vcgtq_f64(a, limit), x, gsf__vd_set_simd128(0.0));
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_add_folded_simd128(gsf__vd_simd128 sum, gsf__vf_simd128 v) {
+    return sum + vcvt_f64_f32(vadd_f32(vget_low_f32(v), vget_high_f32(v)));
+}
+
+#else // WebAssembly
+
+GSF__INLINE_SIMD128 uint32_t gsf__vm_bits_simd128(gsf__vm_simd128 mask) { return (uint32_t)wasm_i32x4_bitmask((v128_t)mask); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_madd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return a * b + c;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_msub_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return a * b - c;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_nmadd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return c - a * b;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_select_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 yes, gsf__vf_simd128 no) {
+    return (gsf__vf_simd128)wasm_v128_bitselect((v128_t)yes, (v128_t)no, (v128_t)mask);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_min_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vf_simd128)wasm_f32x4_pmin((v128_t)b, (v128_t)a); // a < b ? a : b
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_max_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vf_simd128)wasm_f32x4_pmax((v128_t)b, (v128_t)a); // b < a ? a : b
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_sqrt((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_nearest((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_floor((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_ceil((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_truncate_simd128(gsf__vf_simd128 x) {
+    return (gsf__vi_simd128)wasm_i32x4_trunc_sat_f32x4((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_to_int_simd128(gsf__vf_simd128 x) {
+    return gsf__v_truncate_simd128(gsf__v_round_simd128(x));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_floats_simd128(gsf__vi_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_convert_i32x4((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_min_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)wasm_i32x4_min((v128_t)a, (v128_t)b);
+}
+GSF__INLINE_SIMD128 float gsf__v_sum_simd128(gsf__vf_simd128 v) { return (v[0] + v[2]) + (v[1] + v[3]); }
+GSF__INLINE_SIMD128 float gsf__v_largest_simd128(gsf__vf_simd128 v) {
+    const float a = v[0] > v[2] ? v[0] : v[2], b = v[1] > v[3] ? v[1] : v[3];
+    return a > b ? a : b;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_low_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 0, 4, 1, 5);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_high_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 2, 6, 3, 7);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_half_simd128(gsf__vf_simd128 v, int h) {
+    const gsf__vf_simd128 half = h ? __builtin_shufflevector(v, v, 2, 3, 2, 3) : v;
+    return (gsf__vd_simd128)wasm_f64x2_promote_low_f32x4((v128_t)half);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vd_floats_simd128(const gsf__vd_simd128 halves[2]) {
+    const gsf__vf_simd128 low = (gsf__vf_simd128)wasm_f32x4_demote_f64x2_zero((v128_t)halves[0]);
+    const gsf__vf_simd128 high = (gsf__vf_simd128)wasm_f32x4_demote_f64x2_zero((v128_t)halves[1]);
+    return __builtin_shufflevector(low, high, 0, 1, 4, 5);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_madd_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b, gsf__vd_simd128 c) {
+    return a * b + c;
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) { return (gsf__vd_simd128)wasm_f64x2_sqrt((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_max_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b) {
+    return (gsf__vd_simd128)wasm_f64x2_pmax((v128_t)b, (v128_t)a);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_keep_above_simd128(gsf__vd_simd128 a, gsf__vd_simd128 limit, gsf__vd_simd128 x) {
+    return (gsf__vd_simd128)wasm_v128_and(wasm_f64x2_gt((v128_t)a, (v128_t)limit), (v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_add_folded_simd128(gsf__vd_simd128 sum, gsf__vf_simd128 v) {
+    return sum + gsf__vd_half_simd128(v + __builtin_shufflevector(v, v, 2, 3, 2, 3), 0);
+}
+
+#endif
+
+GSF__INLINE_SIMD128 void gsf__v_transpose_simd128(gsf__vf_simd128* m) {
+    const gsf__vf_simd128 a = gsf__v_mix_low_simd128(m[0], m[2]), b = gsf__v_mix_low_simd128(m[1], m[3]);
+    const gsf__vf_simd128 c = gsf__v_mix_high_simd128(m[0], m[2]), d = gsf__v_mix_high_simd128(m[1], m[3]);
+    m[0] = gsf__v_mix_low_simd128(a, b);
+    m[1] = gsf__v_mix_high_simd128(a, b);
+    m[2] = gsf__v_mix_low_simd128(c, d);
+    m[3] = gsf__v_mix_high_simd128(c, d);
+}
+GSF__INLINE_SIMD128 void gsf__vi_store_pairs_simd128(int32_t* p, gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    const gsf__vf_simd128 x = (gsf__vf_simd128)a, y = (gsf__vf_simd128)b;
+    gsf__vi_store_simd128(p, (gsf__vi_simd128)gsf__v_mix_low_simd128(x, y));
+    gsf__vi_store_simd128(p + 4, (gsf__vi_simd128)gsf__v_mix_high_simd128(x, y));
+}
+
+#endif // GSF__SIMD128
+
 // Powers, in terms of the vocabulary. The scalar versions, which have no FMA, go through double.
 
 #define gsf__v_exp2_terms GSF__V(gsf__v_exp2_terms)
@@ -2229,6 +2535,7 @@ GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level) {
         case GSF_CPU_AVX512: return "avx512";
         case GSF_CPU_AVX512_VNNI: return "avx512_vnni";
         case GSF_CPU_AVX512_BF16: return "avx512_bf16";
+        case GSF_CPU_SIMD128: return "simd128";
     }
     return "unknown";
 }
@@ -2278,7 +2585,7 @@ static gsf_cpu_level gsf__detect_cpu_level(void) {
     if (!(seven[2] & vnni)) return GSF_CPU_AVX512;
     return more[0] & bf16 ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
 #else
-    return GSF_CPU_SCALAR;
+    return GSF__SIMD128 ? GSF_CPU_SIMD128 : GSF_CPU_SCALAR;
 #endif
 }
 
@@ -2399,6 +2706,7 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     }
     const gsf_cpu_level best = gsf__detect_cpu_level();
     if (ctx->cpu_level == GSF_CPU_AUTO || ctx->cpu_level > best) ctx->cpu_level = best;
+    if (best == GSF_CPU_SIMD128 && ctx->cpu_level != best) ctx->cpu_level = GSF_CPU_SCALAR; // levels of x86
     ctx->initialized = 1;
     return GSF_OK;
 }
@@ -3420,7 +3728,7 @@ GSF_API gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtype, int64_t wid
     if (width < 1 || height < 1 || channels < 1 || gsf__dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
         (uint64_t)height > SIZE_MAX || !gsf__mul_size((size_t)width, (size_t)height, &count) ||
         !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf__dtype_size(dtype), &bytes) ||
-        bytes > INT64_MAX)
+        bytes > (uint64_t)INT64_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "image: %lld x %lld with %d channels of type %d",
                         (long long)width, (long long)height, (int)channels, (int)dtype);
     void* data = gsf_alloc_zeroed(ctx, bytes, 1);
@@ -5544,7 +5852,13 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
     const gsf__vf log2_e = gsf__v_set(1.44269504f), log2_e_low = gsf__v_set(1.92596299e-8f);
     x = gsf__v_min(gsf__v_set(89.4f), gsf__v_max(gsf__v_set(-87.4f), x)); // exponents of 2: -126.1 and 129
     const gsf__vf rounded = gsf__v_madd(x, log2_e, t.rounder), n = rounded - t.rounder;
-    return gsf__v_power(&t, rounded, gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n)));
+#if GSF__FUSED
+    const gsf__vf f = gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n));
+#else // the remainder of x first: the integer part of n times the first part of ln 2 is exact
+    const gsf__vf rest = (x - n * gsf__v_set(0.693359375f)) - n * gsf__v_set(-2.12194440e-4f);
+    const gsf__vf f = rest * log2_e + rest * log2_e_low;
+#endif
+    return gsf__v_power(&t, rounded, f);
 }
 
 #endif
@@ -5556,6 +5870,7 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
 #define GSF__KERNELS "gsfixer.h"
 #define GSF__KERNELS_POWERS
 #define GSF__KERNELS_AVX512
+#define GSF__KERNELS_SIMD128
 GSF__BEGIN_IMPLEMENTATION
 #include "gsfixer.h" // compiles the kernels above
 GSF__END_IMPLEMENTATION
@@ -5576,8 +5891,14 @@ GSF__END_IMPLEMENTATION
 #include GSF__KERNELS
 #undef GSF__ISA
 #endif
+#if GSF__SIMD128 && defined(GSF__KERNELS_SIMD128)
+#define GSF__ISA simd128
+#include GSF__KERNELS
+#undef GSF__ISA
+#endif
 #undef GSF__KERNELS
 #undef GSF__KERNELS_AVX512
+#undef GSF__KERNELS_SIMD128
 #endif
 #endif // GSF__ISA
 

@@ -5113,6 +5113,7 @@ enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_HIDE
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_HIDE
 #endif // GSF_USE_EMBREE
@@ -5365,7 +5366,7 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
-    job->hide8 = GSF__KERNEL_OF(ctx->cpu_level, gsf__hide8);
+    job->hide8 = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__hide8);
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
@@ -5615,6 +5616,7 @@ static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sum
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_STEREO
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_STEREO
 
@@ -6696,7 +6698,7 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     job->scene = scene;
     job->desc = d;
     job->keep = keep;
-    job->cost_fn = GSF__KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
+    job->cost_fn = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
     gsf__dense_make_window(&d, &job->window);
     double start = gsf__seconds();
     gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
@@ -6993,6 +6995,7 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_PROJECT
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_PROJECT
@@ -7395,6 +7398,7 @@ enum { GSF__SPANS = 8 }; // tile rows processed at a time; a multiple of the num
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_BIN
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_BIN
 
@@ -7445,7 +7449,7 @@ typedef struct gsf__bin_job {
 
 static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int32_t ty, int32_t left,
                             gsf__tile_span spans[GSF__SPANS]) {
-    GSF__KERNEL_OF(gsf__footprint_level(job->view, job->level), gsf__tile_columns)(job->r, rec, ty, left, spans);
+    GSF__LANE_KERNEL_OF(gsf__footprint_level(job->view, job->level), gsf__tile_columns)(job->r, rec, ty, left, spans);
     if (!job->view->official_footprint) return;
     const gsf__tile_rect rect = gsf__official_rect(rec, job->r->tiles_x, job->r->tiles_y);
     for (int32_t i = 0; i < left && i < GSF__SPANS; i++) {
@@ -7703,7 +7707,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     }
 }
 
-#if GSF__X86
+#if GSF__X86 || GSF__SIMD128
 
 // Columns of the pixels of strip k, from 16 k on, and rows of those of a pair of rows j, from 8 j on: for one or two steps.
 GSF__LINES static const float gsf__columns_of[64] = {0,  0,  1,  1,  2,  2,  3,  3,  0,  0,  1,  1,  2,  2,  3,  3,
@@ -7714,6 +7718,10 @@ GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,
                                                   4,  5,  4,  5,  4,  5,  4,  5,  6,  7,  6,  7,  6,  7,  6,  7,
                                                   8,  9,  8,  9,  8,  9,  8,  9,  10, 11, 10, 11, 10, 11, 10, 11,
                                                   12, 13, 12, 13, 12, 13, 12, 13, 14, 15, 14, 15, 14, 15, 14, 15};
+
+#endif
+
+#if GSF__X86
 
 // The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
 // compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
@@ -7954,6 +7962,119 @@ GSF__TARGET_AVX512 static void gsf__blend_avx512(const gsf__tile* tile, gsf__til
 }
 
 #endif // GSF__X86
+
+#if GSF__SIMD128
+
+// A step is two vectors: two columns each, in which the two rows alternate.
+typedef struct gsf__pair_simd128 { gsf__vf_simd128 low, high; } gsf__pair_simd128;
+
+// Like gsf__rows_scalar, 4 rows at a time.
+GSF__INLINE_SIMD128 uint32_t gsf__rows_simd128(const gsf__record* rec, float u, float v, float center[GSF__TILE],
+                                               float exponent[GSF__TILE]) {
+    const gsf__vf_simd128 kx = gsf__v_set_simd128(rec->kx), yy = gsf__v_set_simd128(rec->yy), zero = gsf__v_set_simd128(0.0f);
+    const gsf__vf_simd128 h0 = gsf__v_set_simd128(rec->h0), h1 = gsf__v_set_simd128(rec->h1);
+    const gsf__vf_simd128 lo = gsf__v_set_simd128(rec->log2_opacity), center_u = gsf__v_set_simd128(u);
+    const gsf__vf_simd128 rows = {0, 1, 2, 3}, margin = gsf__v_set_simd128(0.02f), none = gsf__v_set_simd128(-1e30f);
+    uint32_t mask = 0;
+    for (int k = 0; k < GSF__TILE / 4; k++) {
+        const gsf__vf_simd128 dy = rows + gsf__v_set_simd128((float)(4 * k) - v);
+        const gsf__vf_simd128 half2 = gsf__v_nmadd_simd128(h1 * dy, dy, h0), c = gsf__v_madd_simd128(kx, dy, center_u);
+        gsf__v_store_simd128(center + 4 * k, c);
+        gsf__v_store_simd128(exponent + 4 * k, gsf__v_madd_simd128(yy * dy, dy, lo));
+        const gsf__vm_simd128 meets = gsf__v_ge_simd128(half2, zero);
+        if (!gsf__vm_bits_simd128(meets)) continue;
+        const gsf__vf_simd128 wide = gsf__v_sqrt_simd128(gsf__v_max_simd128(half2, zero)) + margin;
+        const gsf__vf_simd128 half = gsf__v_select_simd128(meets, wide, none), left = c - half, right = c + half;
+        for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+            const float column = (float)(GSF__STRIP * strip);
+            const gsf__vf_simd128 last = gsf__v_set_simd128(column + (float)(GSF__STRIP - 1));
+            const uint32_t met = gsf__vm_bits_simd128(gsf__v_le_simd128(left, last) &
+                                                      gsf__v_ge_simd128(right, gsf__v_set_simd128(column)));
+            mask |= (uint32_t)((met & 3u) != 0) << (8 * strip + 2 * k) | (uint32_t)(met > 3u) << (8 * strip + 2 * k + 1);
+        }
+    }
+    return mask;
+}
+
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__exp2_simd128(gsf__vf_simd128 x) { // as gsf__exp2_avx2
+    const gsf__vf_simd128 k = gsf__v_round_simd128(x), f = x - k;
+    gsf__vf_simd128 p = gsf__v_set_simd128(1.3276404e-3f);
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(9.6755413e-3f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(5.5507135e-2f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(0.24022120f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(0.69314694f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(1.0000001f));
+    const gsf__vi_simd128 shift = gsf__vi_shl_simd128(gsf__v_to_int_simd128(k), 23);
+    return gsf__vi_as_floats_simd128(gsf__vi_add_simd128(gsf__v_bits_simd128(p), shift));
+}
+
+// Alphas, before the clamp, of a step whose rows have their centre and exponent in `center` and `exponent`; 0 below 1/255.
+GSF__INLINE_SIMD128 gsf__pair_simd128 gsf__alphas_simd128(float ee, const float* center, const float* exponent, uint32_t s) {
+    const gsf__vf_simd128 c = {center[0], center[1], center[0], center[1]};
+    const gsf__vf_simd128 x0 = {exponent[0], exponent[1], exponent[0], exponent[1]};
+    const gsf__vf_simd128 limit = gsf__v_set_simd128(GSF__LOG2_ALPHA_MIN), scale = gsf__v_set_simd128(ee);
+    const gsf__vf_simd128 e0 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3)) - c;
+    const gsf__vf_simd128 e1 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3) + 4) - c;
+    const gsf__vf_simd128 low = gsf__v_madd_simd128(scale * e0, e0, x0), high = gsf__v_madd_simd128(scale * e1, e1, x0);
+    const gsf__pair_simd128 raw = {gsf__v_keep_simd128(gsf__v_ge_simd128(low, limit), gsf__exp2_simd128(low)),
+                                   gsf__v_keep_simd128(gsf__v_ge_simd128(high, limit), gsf__exp2_simd128(high))};
+    return raw;
+}
+
+// As gsf__next_avx2.
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__next_simd128(gsf__vf_simd128 T, gsf__vf_simd128 raw, gsf__vf_simd128* weight,
+                                                      gsf__vm_simd128* shown) {
+    const gsf__vf_simd128 alpha = gsf__v_min_simd128(raw, gsf__v_set_simd128(GSF__ALPHA_MAX));
+    const gsf__vf_simd128 open = gsf__v_max_simd128(T, gsf__v_set_simd128(0.0f)), next = gsf__v_nmadd_simd128(open, alpha, T);
+    *shown = gsf__v_ge_simd128(next, gsf__v_set_simd128(GSF__T_MIN));
+    *weight = gsf__v_keep_simd128(*shown, open * alpha);
+    const gsf__vf_simd128 finished = (gsf__vf_simd128)((gsf__vi_simd128)T | gsf__vi_set_simd128(-0x7fffffff - 1));
+    return gsf__v_select_simd128(*shown, next, finished);
+}
+
+GSF__INLINE_SIMD128 int gsf__is_open_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { // any of the pixels
+    return gsf__vm_bits_simd128(((gsf__vi_simd128)a & (gsf__vi_simd128)b) >> 31) != 15;
+}
+
+GSF__INLINE_SIMD128 uint32_t gsf__live_simd128(const float* T) {
+    uint32_t live = 0;
+    for (uint32_t s = 0; s < GSF__STEPS; s++)
+        live |= (uint32_t)gsf__is_open_simd128(gsf__v_load_simd128(T + 8 * s), gsf__v_load_simd128(T + 8 * s + 4)) << s;
+    return live;
+}
+
+GSF__INLINE_SIMD128 void gsf__add_simd128(float* sum, gsf__vf_simd128 w0, gsf__vf_simd128 w1, float factor) {
+    const gsf__vf_simd128 f = gsf__v_set_simd128(factor);
+    gsf__v_store_simd128(sum, gsf__v_madd_simd128(w0, f, gsf__v_load_simd128(sum)));
+    gsf__v_store_simd128(sum + 4, gsf__v_madd_simd128(w1, f, gsf__v_load_simd128(sum + 4)));
+}
+
+static void gsf__blend_simd128(const gsf__tile* tile, gsf__tile_state* state, int flags) {
+    uint32_t live = gsf__live_simd128(state->T);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    for (size_t i = 0; i < tile->count && live; i++) {
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
+        for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
+            const size_t at = 8 * s;
+            const gsf__pair_simd128 raw = gsf__alphas_simd128(rec->ee, center + row, exponent + row, s);
+            gsf__vf_simd128 w0, w1;
+            gsf__vm_simd128 shown;
+            const gsf__vf_simd128 T0 = gsf__next_simd128(gsf__v_load_simd128(state->T + at), raw.low, &w0, &shown);
+            const gsf__vf_simd128 T1 = gsf__next_simd128(gsf__v_load_simd128(state->T + at + 4), raw.high, &w1, &shown);
+            gsf__v_store_simd128(state->T + at, T0);
+            gsf__v_store_simd128(state->T + at + 4, T1);
+            gsf__add_simd128(state->r + at, w0, w1, rec->r);
+            gsf__add_simd128(state->g + at, w0, w1, rec->g);
+            gsf__add_simd128(state->b + at, w0, w1, rec->b);
+            if (flags & GSF__WITH_DEPTH) gsf__add_simd128(state->z + at, w0, w1, rec->depth);
+            if (!gsf__is_open_simd128(T0, T1)) live &= ~(1u << s);
+        }
+    }
+}
+
+#endif // GSF__SIMD128
 
 // ---- >>raster backward ---------------------------------------------------------
 
@@ -8266,6 +8387,120 @@ GSF__TARGET_AVX512 static void gsf__reverse_avx512(const gsf__tile* tile, const 
 
 #endif // GSF__X86
 
+#if GSF__SIMD128
+
+static size_t gsf__keep_simd128(const gsf__tile* tile, float* T_tile, size_t first, size_t last, gsf__step* steps,
+                                gsf__step_head* heads, size_t* step_count) {
+    uint32_t live = gsf__live_simd128(T_tile);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    size_t kept = 0, i = first;
+    for (; i < last && live && kept <= GSF__BUCKET; i++) {
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
+        for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
+            float* T = T_tile + 8 * s;
+            const gsf__pair_simd128 raw = gsf__alphas_simd128(rec->ee, center + row, exponent + row, s);
+            gsf__vf_simd128 weight;
+            gsf__vm_simd128 shown0, shown1;
+            const gsf__vf_simd128 old0 = gsf__v_load_simd128(T), old1 = gsf__v_load_simd128(T + 4);
+            const gsf__vf_simd128 T0 = gsf__next_simd128(old0, raw.low, &weight, &shown0);
+            const gsf__vf_simd128 T1 = gsf__next_simd128(old1, raw.high, &weight, &shown1);
+            gsf__v_store_simd128(T, T0);
+            gsf__v_store_simd128(T + 4, T1);
+            const gsf__vf_simd128 alpha0 = gsf__v_keep_simd128(shown0, raw.low), alpha1 = gsf__v_keep_simd128(shown1, raw.high);
+            gsf__v_store_simd128(steps[kept].alpha, alpha0);
+            gsf__v_store_simd128(steps[kept].alpha + 4, alpha1);
+            gsf__v_store_simd128(steps[kept].T, old0);
+            gsf__v_store_simd128(steps[kept].T + 4, old1);
+            heads[kept].entry = (uint32_t)i;
+            heads[kept].step = s;
+            kept += gsf__vm_bits_simd128(gsf__v_gt_simd128(alpha0 + alpha1, gsf__v_set_simd128(0.0f))) != 0;
+            if (!gsf__is_open_simd128(T0, T1)) live &= ~(1u << s);
+        }
+    }
+    *step_count = kept;
+    return live && i < last ? i : tile->count;
+}
+
+GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                                   size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                                   uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
+    const gsf__vf_simd128 alpha_max = gsf__v_set_simd128(GSF__ALPHA_MAX), zero = gsf__v_set_simd128(0.0f);
+    for (size_t k = step_count; k > 0;) {
+        const uint32_t entry = heads[k - 1].entry;
+        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__vf_simd128 u = gsf__v_set_simd128(rec->u - tile->x0 + rec->u_low);
+        const gsf__vf_simd128 v = gsf__v_set_simd128(rec->v - tile->y0 + rec->v_low), kx = gsf__v_set_simd128(rec->kx);
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        gsf__vf_simd128 sum[GSF__SLOT_FLOATS];
+        for (int i = 0; i < GSF__SLOT_FLOATS; i++) sum[i] = zero;
+        for (; k > 0 && heads[k - 1].entry == entry; k--) {
+            const gsf__step* step = steps + k - 1;
+            const size_t s = heads[k - 1].step;
+            for (size_t half = 0; half < 8; half += 4) {
+                const size_t at = 8 * s + half;
+                const gsf__vf_simd128 dy = gsf__v_load_simd128(gsf__rows_of + 8 * (s & 7) + half) - v;
+                const gsf__vf_simd128 e = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3) + half) -
+                                          gsf__v_madd_simd128(kx, dy, u);
+                const gsf__vf_simd128 raw = gsf__v_load_simd128(step->alpha + half), T = gsf__v_load_simd128(step->T + half);
+                const gsf__vf_simd128 gr = gsf__v_load_simd128(gradient->r + at), gg = gsf__v_load_simd128(gradient->g + at);
+                const gsf__vf_simd128 gb = gsf__v_load_simd128(gradient->b + at);
+                const gsf__vf_simd128 behind = gsf__v_load_simd128(gradient->behind + at);
+                const gsf__vf_simd128 alpha = gsf__v_min_simd128(raw, alpha_max), w = alpha * T;
+                gsf__vf_simd128 F = gsf__v_msub_simd128(gsf__v_set_simd128(rec->r), gr, behind);
+                F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->g), gg, F);
+                F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->b), gb, F);
+                if (with_depth) {
+                    const gsf__vf_simd128 gz = gsf__v_load_simd128(gradient->z + at);
+                    F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->depth), gz, F) + gsf__v_load_simd128(gradient->a + at);
+                    sum[GSF__SLOT_Z] = gsf__v_madd_simd128(w, gz, sum[GSF__SLOT_Z]);
+                }
+                gsf__v_store_simd128(gradient->behind + at, gsf__v_madd_simd128(alpha, F, behind));
+                gsf__vf_simd128 p = T * raw * F;
+                if (!straight_through) p = gsf__v_keep_simd128(gsf__v_le_simd128(raw, alpha_max), p);
+                const gsf__vf_simd128 pe = p * e, py = p * dy;
+                sum[GSF__SLOT_P] = sum[GSF__SLOT_P] + p;
+                sum[GSF__SLOT_E] = sum[GSF__SLOT_E] + pe;
+                sum[GSF__SLOT_EE] = gsf__v_madd_simd128(pe, e, sum[GSF__SLOT_EE]);
+                sum[GSF__SLOT_Y] = sum[GSF__SLOT_Y] + py;
+                sum[GSF__SLOT_EY] = gsf__v_madd_simd128(pe, dy, sum[GSF__SLOT_EY]);
+                sum[GSF__SLOT_YY] = gsf__v_madd_simd128(py, dy, sum[GSF__SLOT_YY]);
+                sum[GSF__SLOT_R] = gsf__v_madd_simd128(w, gr, sum[GSF__SLOT_R]);
+                sum[GSF__SLOT_G] = gsf__v_madd_simd128(w, gg, sum[GSF__SLOT_G]);
+                sum[GSF__SLOT_B] = gsf__v_madd_simd128(w, gb, sum[GSF__SLOT_B]);
+                if (with_abs) {
+                    const gsf__vf_simd128 dv = gsf__v_madd_simd128(gsf__v_set_simd128(conic_b), pe,
+                                                                   gsf__v_set_simd128(conic_q) * py);
+                    sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] + gsf__v_abs_simd128(pe);
+                    sum[GSF__SLOT_ABS_Y] = sum[GSF__SLOT_ABS_Y] + gsf__v_abs_simd128(dv);
+                }
+            }
+        }
+        const size_t slot = tile->pairs[entry].slot;
+        sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] * gsf__v_set_simd128(conic_a);
+        for (int i = 0; i < GSF__SLOT_FLOATS; i += 4) { // complete: an entry's steps are all in one bucket
+            gsf__v_transpose_simd128(sum + i);
+            gsf__v_store_simd128(slots + GSF__SLOT_FLOATS * slot + i, (sum[i] + sum[i + 2]) + (sum[i + 1] + sum[i + 3]));
+        }
+        slot_used[slot] = 1;
+    }
+}
+
+static void gsf__reverse_simd128(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
+                                 gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int flags) {
+    if (flags == 0)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0, 0);
+    else if (flags == GSF__WITH_DEPTH)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 0);
+    else if (flags & GSF__STRAIGHT_THROUGH)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1, 1);
+    else
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
+}
+
+#endif // GSF__SIMD128
+
 static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
     const gsf__raster_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__blend), GSF__WIDE_KERNEL_OF(level, gsf__keep),
                                          GSF__WIDE_KERNEL_OF(level, gsf__reverse)};
@@ -8276,6 +8511,7 @@ static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_GATHER
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_GATHER
 
@@ -8522,8 +8758,8 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
     const size_t end = gsf__splat_chunk_end(job->r, chunk);
-    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__KERNEL_OF(job->level, GSF__LANES))
-        GSF__KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__LANE_KERNEL_OF(job->level, GSF__LANES))
+        GSF__LANE_KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
 }
 
 // ---- >>render ------------------------------------------------------------------
@@ -8955,6 +9191,7 @@ static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) 
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_LOSS
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_LOSS
@@ -9125,6 +9362,16 @@ GSF__TARGET_AVX512 static void gsf__loss_across_avx512(const float* v, size_t n,
 }
 #undef GSF__LOSS_BETWEEN
 
+#elif GSF__SIMD128
+static void gsf__loss_across_simd128(const float* v, size_t n, float* sums) {
+    const gsf__vf_simd128 middle = gsf__v_set_simd128(gsf__loss_window[0]);
+    for (size_t i = 0; i < n; i += 4, v += 4) {
+        gsf__vf_simd128 s = middle * gsf__v_load_simd128(v);
+        for (int k = 1; k <= GSF__LOSS_RADIUS; k++)
+            s = gsf__loss_taps_simd128(k, gsf__v_load_simd128(v - 3 * k), gsf__v_load_simd128(v + 3 * k), s);
+        gsf__v_store_simd128(sums + i, s);
+    }
+}
 #endif
 
 static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
@@ -9639,6 +9886,7 @@ static uint32_t gsf__count_bits(uint32_t bits) {
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_ADAM
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_ADAM
