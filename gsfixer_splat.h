@@ -7968,30 +7968,76 @@ GSF__TARGET_AVX512 static void gsf__blend_avx512(const gsf__tile* tile, gsf__til
 // A step is two vectors: two columns each, in which the two rows alternate.
 typedef struct gsf__pair_simd128 { gsf__vf_simd128 low, high; } gsf__pair_simd128;
 
-// Like gsf__rows_scalar, 4 rows at a time.
+#if GSF__NEON
+GSF__INLINE_SIMD128 uint32_t gsf__bits8_simd128(gsf__vm_simd128 low, gsf__vm_simd128 high) { // a bit per lane of both
+    const uint16x8_t bit = {1, 2, 4, 8, 16, 32, 64, 128};
+    return vaddvq_u16(vandq_u16(vuzp1q_u16(vreinterpretq_u16_s32(low), vreinterpretq_u16_s32(high)), bit));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__twice_simd128(const float* p) { // p[0] p[1] p[0] p[1]
+    const float32x2_t pair = vld1_f32(p);
+    return vcombine_f32(pair, pair);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__even_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vuzp1q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__odd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vuzp2q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__least_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vminq_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__most_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vmaxq_f32(a, b); }
+GSF__INLINE_SIMD128 int gsf__all_negative_simd128(gsf__vi_simd128 x) { return vmaxvq_s32(x) < 0; }
+GSF__INLINE_SIMD128 int gsf__any_positive_simd128(gsf__vf_simd128 x) { return vmaxvq_f32(x) > 0.0f; }
+#else
+GSF__INLINE_SIMD128 uint32_t gsf__bits8_simd128(gsf__vm_simd128 low, gsf__vm_simd128 high) {
+    return (uint32_t)wasm_i16x8_bitmask(wasm_i16x8_narrow_i32x4((v128_t)low, (v128_t)high));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__twice_simd128(const float* p) {
+    return (gsf__vf_simd128)wasm_v128_load64_splat(p);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__even_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 0, 2, 4, 6);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__odd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 1, 3, 5, 7);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__least_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return gsf__v_min_simd128(a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__most_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return gsf__v_max_simd128(a, b);
+}
+GSF__INLINE_SIMD128 int gsf__all_negative_simd128(gsf__vi_simd128 x) { return wasm_i32x4_bitmask((v128_t)x) == 15; }
+GSF__INLINE_SIMD128 int gsf__any_positive_simd128(gsf__vf_simd128 x) {
+    return wasm_v128_any_true(wasm_f32x4_gt((v128_t)x, wasm_f32x4_const(0, 0, 0, 0)));
+}
+#endif
+
+// Like gsf__rows_scalar, 4 rows at a time. Values are finite, so that least and most need not care for a NaN.
 GSF__INLINE_SIMD128 uint32_t gsf__rows_simd128(const gsf__record* rec, float u, float v, float center[GSF__TILE],
                                                float exponent[GSF__TILE]) {
     const gsf__vf_simd128 kx = gsf__v_set_simd128(rec->kx), yy = gsf__v_set_simd128(rec->yy), zero = gsf__v_set_simd128(0.0f);
     const gsf__vf_simd128 h0 = gsf__v_set_simd128(rec->h0), h1 = gsf__v_set_simd128(rec->h1);
     const gsf__vf_simd128 lo = gsf__v_set_simd128(rec->log2_opacity), center_u = gsf__v_set_simd128(u);
     const gsf__vf_simd128 rows = {0, 1, 2, 3}, margin = gsf__v_set_simd128(0.02f), none = gsf__v_set_simd128(-1e30f);
-    uint32_t mask = 0;
+    gsf__vf_simd128 left[GSF__TILE / 4], right[GSF__TILE / 4], from[2], to[2];
     for (int k = 0; k < GSF__TILE / 4; k++) {
         const gsf__vf_simd128 dy = rows + gsf__v_set_simd128((float)(4 * k) - v);
         const gsf__vf_simd128 half2 = gsf__v_nmadd_simd128(h1 * dy, dy, h0), c = gsf__v_madd_simd128(kx, dy, center_u);
         gsf__v_store_simd128(center + 4 * k, c);
         gsf__v_store_simd128(exponent + 4 * k, gsf__v_madd_simd128(yy * dy, dy, lo));
-        const gsf__vm_simd128 meets = gsf__v_ge_simd128(half2, zero);
-        if (!gsf__vm_bits_simd128(meets)) continue;
-        const gsf__vf_simd128 wide = gsf__v_sqrt_simd128(gsf__v_max_simd128(half2, zero)) + margin;
-        const gsf__vf_simd128 half = gsf__v_select_simd128(meets, wide, none), left = c - half, right = c + half;
-        for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
-            const float column = (float)(GSF__STRIP * strip);
-            const gsf__vf_simd128 last = gsf__v_set_simd128(column + (float)(GSF__STRIP - 1));
-            const uint32_t met = gsf__vm_bits_simd128(gsf__v_le_simd128(left, last) &
-                                                      gsf__v_ge_simd128(right, gsf__v_set_simd128(column)));
-            mask |= (uint32_t)((met & 3u) != 0) << (8 * strip + 2 * k) | (uint32_t)(met > 3u) << (8 * strip + 2 * k + 1);
-        }
+        const gsf__vf_simd128 wide = gsf__v_sqrt_simd128(gsf__most_simd128(half2, zero)) + margin;
+        const gsf__vf_simd128 half = gsf__v_select_simd128(gsf__v_ge_simd128(half2, zero), wide, none);
+        left[k] = c - half;
+        right[k] = c + half;
+    }
+    for (int k = 0; k < 2; k++) { // of two rows, the union, which has no gap because the ellipse is convex
+        from[k] = gsf__least_simd128(gsf__even_simd128(left[2 * k], left[2 * k + 1]),
+                                     gsf__odd_simd128(left[2 * k], left[2 * k + 1]));
+        to[k] = gsf__most_simd128(gsf__even_simd128(right[2 * k], right[2 * k + 1]),
+                                  gsf__odd_simd128(right[2 * k], right[2 * k + 1]));
+    }
+    uint32_t mask = 0;
+    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+        const gsf__vf_simd128 first = gsf__v_set_simd128((float)(GSF__STRIP * strip));
+        const gsf__vf_simd128 last = gsf__v_set_simd128((float)(GSF__STRIP * strip + GSF__STRIP - 1));
+        mask |= gsf__bits8_simd128(gsf__v_le_simd128(from[0], last) & gsf__v_ge_simd128(to[0], first),
+                                   gsf__v_le_simd128(from[1], last) & gsf__v_ge_simd128(to[1], first)) << (8 * strip);
     }
     return mask;
 }
@@ -8010,8 +8056,7 @@ GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__exp2_simd128(gsf__vf_simd128 x) { // as
 
 // Alphas, before the clamp, of a step whose rows have their centre and exponent in `center` and `exponent`; 0 below 1/255.
 GSF__INLINE_SIMD128 gsf__pair_simd128 gsf__alphas_simd128(float ee, const float* center, const float* exponent, uint32_t s) {
-    const gsf__vf_simd128 c = {center[0], center[1], center[0], center[1]};
-    const gsf__vf_simd128 x0 = {exponent[0], exponent[1], exponent[0], exponent[1]};
+    const gsf__vf_simd128 c = gsf__twice_simd128(center), x0 = gsf__twice_simd128(exponent);
     const gsf__vf_simd128 limit = gsf__v_set_simd128(GSF__LOG2_ALPHA_MIN), scale = gsf__v_set_simd128(ee);
     const gsf__vf_simd128 e0 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3)) - c;
     const gsf__vf_simd128 e1 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3) + 4) - c;
@@ -8024,8 +8069,8 @@ GSF__INLINE_SIMD128 gsf__pair_simd128 gsf__alphas_simd128(float ee, const float*
 // As gsf__next_avx2.
 GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__next_simd128(gsf__vf_simd128 T, gsf__vf_simd128 raw, gsf__vf_simd128* weight,
                                                       gsf__vm_simd128* shown) {
-    const gsf__vf_simd128 alpha = gsf__v_min_simd128(raw, gsf__v_set_simd128(GSF__ALPHA_MAX));
-    const gsf__vf_simd128 open = gsf__v_max_simd128(T, gsf__v_set_simd128(0.0f)), next = gsf__v_nmadd_simd128(open, alpha, T);
+    const gsf__vf_simd128 alpha = gsf__least_simd128(raw, gsf__v_set_simd128(GSF__ALPHA_MAX));
+    const gsf__vf_simd128 open = gsf__most_simd128(T, gsf__v_set_simd128(0.0f)), next = gsf__v_nmadd_simd128(open, alpha, T);
     *shown = gsf__v_ge_simd128(next, gsf__v_set_simd128(GSF__T_MIN));
     *weight = gsf__v_keep_simd128(*shown, open * alpha);
     const gsf__vf_simd128 finished = (gsf__vf_simd128)((gsf__vi_simd128)T | gsf__vi_set_simd128(-0x7fffffff - 1));
@@ -8033,7 +8078,7 @@ GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__next_simd128(gsf__vf_simd128 T, gsf__vf
 }
 
 GSF__INLINE_SIMD128 int gsf__is_open_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { // any of the pixels
-    return gsf__vm_bits_simd128(((gsf__vi_simd128)a & (gsf__vi_simd128)b) >> 31) != 15;
+    return !gsf__all_negative_simd128((gsf__vi_simd128)a & (gsf__vi_simd128)b);
 }
 
 GSF__INLINE_SIMD128 uint32_t gsf__live_simd128(const float* T) {
@@ -8415,7 +8460,7 @@ static size_t gsf__keep_simd128(const gsf__tile* tile, float* T_tile, size_t fir
             gsf__v_store_simd128(steps[kept].T + 4, old1);
             heads[kept].entry = (uint32_t)i;
             heads[kept].step = s;
-            kept += gsf__vm_bits_simd128(gsf__v_gt_simd128(alpha0 + alpha1, gsf__v_set_simd128(0.0f))) != 0;
+            kept += (size_t)gsf__any_positive_simd128(alpha0 + alpha1);
             if (!gsf__is_open_simd128(T0, T1)) live &= ~(1u << s);
         }
     }
@@ -8447,7 +8492,7 @@ GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const 
                 const gsf__vf_simd128 gr = gsf__v_load_simd128(gradient->r + at), gg = gsf__v_load_simd128(gradient->g + at);
                 const gsf__vf_simd128 gb = gsf__v_load_simd128(gradient->b + at);
                 const gsf__vf_simd128 behind = gsf__v_load_simd128(gradient->behind + at);
-                const gsf__vf_simd128 alpha = gsf__v_min_simd128(raw, alpha_max), w = alpha * T;
+                const gsf__vf_simd128 alpha = gsf__least_simd128(raw, alpha_max), w = alpha * T;
                 gsf__vf_simd128 F = gsf__v_msub_simd128(gsf__v_set_simd128(rec->r), gr, behind);
                 F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->g), gg, F);
                 F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->b), gb, F);
