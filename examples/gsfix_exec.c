@@ -119,7 +119,10 @@ static gsf_result write_job(gsf_context* ctx, exec_state* e, const gsf_restore_w
 // The command line for cmd.exe, which removes the outer quotes only (/s) and runs no start-up script (/d).
 static wchar_t* command_line(gsf_context* ctx, const exec_state* e) {
     gsf_buffer line = {0};
-    gsf_append_text(ctx, &line, "cmd.exe /d /s /c \"%s \"%s\"\"", e->command, e->job);
+    gsfix_path job = gsfix_pathf("%s", e->job); // the shell's own commands take slashes for options
+    for (char* c = job.s; *c; c++)
+        if (*c == '/') *c = '\\';
+    gsf_append_text(ctx, &line, "cmd.exe /d /s /c \"%s \"%s\"\"", e->command, job.s);
     const int size = line.failed ? 0 : MultiByteToWideChar(CP_UTF8, 0, line.data, -1, NULL, 0);
     wchar_t* wide = size > 0 ? (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide) : NULL;
     if (wide) MultiByteToWideChar(CP_UTF8, 0, line.data, -1, wide, size);

@@ -111,7 +111,7 @@ static wchar_t* w_path_at(int folder, const char* name) {
 }
 
 static wchar_t* w_final_path(HANDLE handle) { // in the form \\?\ without a final backslash
-    const DWORD room = GetFinalPathNameByHandleW(handle, NULL, 0, 0);
+    const DWORD room = GetFinalPathNameByHandleW(handle, NULL, 0, FILE_NAME_NORMALIZED | VOLUME_NAME_DOS);
     wchar_t* path = room ? (wchar_t*)malloc(((size_t)room + 1) * sizeof *path) : NULL;
     if (!path) return NULL;
     const DWORD used = GetFinalPathNameByHandleW(handle, path, room + 1, 0);
@@ -122,9 +122,17 @@ static wchar_t* w_final_path(HANDLE handle) { // in the form \\?\ without a fina
 
 // ---- descriptors -----------------------------------------------------------------
 
-static int w_keep(HANDLE handle, int flags) {
-    wchar_t* path = NULL;
-    if (flags & GSFIX_W_DIRECTORY) path = w_final_path(handle);
+static wchar_t* w_copy(const wchar_t* text) {
+    const size_t bytes = (wcslen(text) + 1) * sizeof *text;
+    wchar_t* copy = (wchar_t*)malloc(bytes);
+    if (copy) memcpy(copy, text, bytes);
+    return copy;
+}
+
+// opened: the path of a folder, which counts if the system cannot tell where links have led to (Wine, of long ones).
+static int w_keep(HANDLE handle, const wchar_t* opened, int flags) {
+    wchar_t* path = flags & GSFIX_W_DIRECTORY ? w_final_path(handle) : NULL;
+    if (!path && (flags & GSFIX_W_DIRECTORY)) path = w_copy(opened);
     for (int i = 0; i < W_FILES && (path || !(flags & GSFIX_W_DIRECTORY)); i++) {
         if (w_files[i].handle) continue;
         const w_file fresh = {handle, path, flags & GSFIX_W_APPEND};
@@ -162,14 +170,18 @@ static int w_open_path(wchar_t* path, int flags) { // frees path
     const DWORD how = flags & GSFIX_W_EXCL ? CREATE_NEW : flags & GSFIX_W_CREAT ? OPEN_ALWAYS : OPEN_EXISTING;
     const DWORD links = flags & GSFIX_W_NOFOLLOW ? FILE_FLAG_OPEN_REPARSE_POINT : 0;
     HANDLE handle = w_create(path, access, how, links | (is_folder ? FILE_FLAG_BACKUP_SEMANTICS : FILE_ATTRIBUTE_NORMAL));
-    const DWORD reason = GetLastError();
-    free(path);
-    if (handle == INVALID_HANDLE_VALUE) return w_fail(reason);
+    if (handle == INVALID_HANDLE_VALUE) {
+        w_fail(GetLastError());
+        free(path);
+        return -1;
+    }
     BY_HANDLE_FILE_INFORMATION info;
     const int known = GetFileInformationByHandle(handle, &info) != 0;
     const int wrong = is_folder && (!known || !(info.dwFileAttributes & FILE_ATTRIBUTE_DIRECTORY));
     const int link = links && w_is_link(handle);
-    if (!wrong && !link) return w_keep(handle, flags);
+    const int file = wrong || link ? -1 : w_keep(handle, path, flags);
+    free(path);
+    if (!wrong && !link) return file;
     CloseHandle(handle);
     errno = link ? ELOOP : ENOTDIR;
     return -1;
@@ -184,7 +196,7 @@ int gsfix_w_dup(int file) { // of a folder
     if (!from) return -1;
     if (!DuplicateHandle(process, from->handle, process, &handle, 0, FALSE, DUPLICATE_SAME_ACCESS))
         return w_fail(GetLastError());
-    return w_keep(handle, from->path ? GSFIX_W_DIRECTORY : 0);
+    return w_keep(handle, from->path, from->path ? GSFIX_W_DIRECTORY : 0);
 }
 
 int gsfix_w_close(int file) {

@@ -23,6 +23,7 @@ static float interesting(size_t i) {
 #define GSF__KERNELS "tests/test_lanes.c" // as gsfixer.h sees it
 #define GSF__KERNELS_CHECKS
 #define GSF__KERNELS_AVX512
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_CHECKS
 
@@ -33,6 +34,8 @@ int main(void) {
 #if GSF__X86
     if (ctx.cpu_level >= GSF_CPU_AVX2) check_lanes_avx2();
     if (ctx.cpu_level >= GSF_CPU_AVX512) check_lanes_avx512();
+#elif GSF__SIMD128
+    if (ctx.cpu_level == GSF_CPU_SIMD128) check_lanes_simd128();
 #endif
     return test_report();
 }
