@@ -42,20 +42,16 @@ cmp -s Straße_1/splats.ply killed/splats.ply || fail "a resumed run has other s
 gsfix render Straße_1/splats.ply --scene S --out bilder > log 2>&1 || { fail "render"; tail -n 3 log; }
 [ "$(ls bilder | wc -l)" -ge 8 ] || fail "renders are missing"
 
-# External restorers by cmd.exe; the job folder comes as an absolute path. Wine's cmd.exe copies no files with such names.
-mkdir ../plain
-cp -r S ../plain/S
-cd ../plain
-printf '@mkdir "%%~1\\out"\r\n@copy "%%~1\\frames\\*.png" "%%~1\\out" > nul\r\n' > copy.cmd
+# External restorers by cmd.exe; the job folder comes as an absolute path.
+printf '@mkdir "%%~1\\out"\r\n@copy "%%~1\\frames\\*.png" "%%~1\\out" > nul\r\n' > restorer.cmd
 printf '@exit 3\r\n' > fails.cmd
 printf ':again\r\n@goto again\r\n' > hangs.cmd
-fix --out copied --iterations 30 --restorer 'exec:copy.cmd' > log 2>&1 || { fail "exec"; tail -n 3 log; }
+fix --out copied --iterations 30 --restorer 'exec:restorer.cmd' > log 2>&1 || { fail "exec"; tail -n 3 log; }
 ls -d copied/job-* > /dev/null 2>&1 && fail "a job folder is left"
 says "ended with status 3" fix --out failed --iterations 30 --restorer 'exec:fails.cmd'
 says "took longer than 2 s" fix --out hung --iterations 30 --restorer 'exec:hangs.cmd' --restorer-timeout 2
 
 # What is not gsfix's stays.
-cd ../Größe_日本
 echo mine > Straße_1/splats.ply
 says "not written by gsfix" fix --out Straße_1 --iterations 30 --restart
 [ "$(cat Straße_1/splats.ply)" = mine ] || fail "a foreign file was replaced"
