@@ -3728,7 +3728,7 @@ GSF_API gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtype, int64_t wid
     if (width < 1 || height < 1 || channels < 1 || gsf__dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
         (uint64_t)height > SIZE_MAX || !gsf__mul_size((size_t)width, (size_t)height, &count) ||
         !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf__dtype_size(dtype), &bytes) ||
-        bytes > (uint64_t)INT64_MAX)
+        (uint64_t)bytes >> 63)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "image: %lld x %lld with %d channels of type %d",
                         (long long)width, (long long)height, (int)channels, (int)dtype);
     void* data = gsf_alloc_zeroed(ctx, bytes, 1);

@@ -1,7 +1,6 @@
-# 64-bit Arm; programs run under QEMU. Linked statically, so that no libraries of that machine have to be found.
+# 64-bit Arm; programs run under QEMU, with the libraries of the cross compiler.
 set(CMAKE_SYSTEM_NAME Linux)
 set(CMAKE_SYSTEM_PROCESSOR aarch64)
 set(CMAKE_C_COMPILER aarch64-linux-gnu-gcc)
-set(CMAKE_EXE_LINKER_FLAGS_INIT "-static")
-set(CMAKE_CROSSCOMPILING_EMULATOR qemu-aarch64)
+set(CMAKE_CROSSCOMPILING_EMULATOR qemu-aarch64 -L /usr/aarch64-linux-gnu)
 include("${CMAKE_CURRENT_LIST_DIR}/stb.cmake")

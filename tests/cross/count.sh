@@ -6,7 +6,7 @@ program=$1 scratch=$2
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 mkdir -p "$scratch"
 gcc -std=c11 -O1 -shared -fPIC "$here/count.c" -o "$scratch/count.so"
-count() { qemu-aarch64 -d plugin -plugin "$scratch/count.so" "$program" "$1" "$2" "$3" 2>&1 | sed -n 's/^instructions //p'; }
+count() { qemu-aarch64 -L /usr/aarch64-linux-gnu -d plugin -plugin "$scratch/count.so" "$program" "$1" "$2" "$3" 2>&1 | sed -n 's/^instructions //p'; }
 declare -A work
 for kind in render backward; do
     for level in scalar best; do
