@@ -67,7 +67,7 @@ GSF__V_KERNEL void GSF__V(check_pairs)(const float* x, const float* y, const flo
             const double p = op == 2 ? -(double)x[i] : (double)x[i], r = op == 1 ? -(double)z[i] : (double)z[i];
             const double exact = p * (double)y[i] + r, size = fabs(p * (double)y[i]) + fabs(r); // exact products
             if (isfinite(exact) && size < 3e38)
-                CHECK(fabs((double)out[i] - exact) <= 1.2e-7 * (GSF__LANES == 1 ? size : fabs(exact)) + 1e-45);
+                CHECK(fabs((double)out[i] - exact) <= 1.2e-7 * (GSF__FUSED ? fabs(exact) : size) + 1e-45);
             else if (isnan(exact))
                 CHECK(out[i] != out[i]);
         }
