@@ -41,8 +41,13 @@
                ctx->error and passed to the log hook. On error, outputs are zeroed or unchanged and nothing leaks.
    MEMORY      All memory comes from the context's allocator. The caller that makes an object destroys it with the same
                context.
-   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 17 KB; -O0: 31 KB), so threads
+   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 16 KB; -O0: 31 KB), so threads
                with 256 KB are enough.
+   PLATFORMS   64-bit Linux, Windows (MinGW-w64; file names are UTF-8 and may be longer than 260 characters), macOS, Arm with
+               NEON, WebAssembly with or without -msimd128. The compiler of Visual Studio gets the scalar kernels, clang-cl
+               those for AVX2 and AVX-512. Training with the scalar kernels gives the same bits on all of them, with any
+               compiler flags that keep IEEE 754 (not -ffast-math), as long as the rounding mode is the default, to nearest:
+               a host that changes it sets it back around calls.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
    NAMES       Functions are gsf_VERB_NOUN, in the modules gsf_traj_VERB_NOUN, gsf_splat_VERB_NOUN and gsf_nn_VERB_NOUN;
@@ -1473,8 +1478,8 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 
 /* The C libraries of Linux, Windows, Arm and the browsers differ in the last bits of exp, log, sin and so on, and glibc's in
    those of machines with and without FMA. What a scene's training depends on is therefore computed here, by additions,
-   multiplications, divisions and sqrt, which IEEE 754 defines to the bit. Errors are below 1 ulp of double unless a comment says
-   otherwise; the rounding mode has to be the default (to nearest). */
+   multiplications, divisions and sqrt, which IEEE 754 defines to the bit. Errors are below 1 ulp of double unless a comment
+   says otherwise; the rounding mode has to be the default (to nearest). */
 
 #define GSF__LN2_HIGH 0.693147180369123816490 // its last 32 bits are 0: a product with an exponent is exact
 #define GSF__LN2_LOW 1.90821492927058770002e-10
@@ -2306,11 +2311,17 @@ GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_bytes_simd128(const uint8_t* p, 
                                n > 3 ? (float)p[3] : 0.0f};
     return v;
 }
-GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_eq_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a == b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_eq_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a == b);
+}
 GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_lt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a < b); }
-GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_le_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a <= b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_le_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a <= b);
+}
 GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_gt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a > b); }
-GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_ge_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a >= b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_ge_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a >= b);
+}
 GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_keep_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 x) {
     return (gsf__vf_simd128)(mask & (gsf__vi_simd128)x);
 }
@@ -2411,10 +2422,18 @@ GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_min_simd128(gsf__vf_simd128 a, gsf__v
 GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_max_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
     return (gsf__vf_simd128)wasm_f32x4_pmax((v128_t)b, (v128_t)a); // b < a ? a : b
 }
-GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_sqrt((v128_t)x); }
-GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_nearest((v128_t)x); }
-GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_floor((v128_t)x); }
-GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) { return (gsf__vf_simd128)wasm_f32x4_ceil((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_sqrt((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_nearest((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_floor((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_ceil((v128_t)x);
+}
 GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_truncate_simd128(gsf__vf_simd128 x) {
     return (gsf__vi_simd128)wasm_i32x4_trunc_sat_f32x4((v128_t)x);
 }
@@ -2450,7 +2469,9 @@ GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vd_floats_simd128(const gsf__vd_simd128
 GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_madd_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b, gsf__vd_simd128 c) {
     return a * b + c;
 }
-GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) { return (gsf__vd_simd128)wasm_f64x2_sqrt((v128_t)x); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) {
+    return (gsf__vd_simd128)wasm_f64x2_sqrt((v128_t)x);
+}
 GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_max_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b) {
     return (gsf__vd_simd128)wasm_f64x2_pmax((v128_t)b, (v128_t)a);
 }

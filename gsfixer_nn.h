@@ -6291,7 +6291,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int32_t worker) {
     const int64_t n_end = gsf__least(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)block * gsf__conv_panel(layer);
     float* weights = panel + GSF__CONV_N;
-    float values[CHANNELS * GSF__CONV_TAPS];
+    float values[(int)CHANNELS * (int)GSF__CONV_TAPS];
     (void)worker;
     if (n_end < GSF__CONV_N || !layer->bias) memset(panel, 0, (size_t)gsf__conv_panel(layer) * sizeof(float));
     if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, panel);

@@ -8601,6 +8601,7 @@ GSF__V_INLINE void GSF__V(gsf__add_column)(float* rows, size_t stride, gsf__vf v
 // Sums the slots of each splat from i on, in double and in tile order, into the first GSF__SLOT_FLOATS columns. Returns
 // a bit for every splat that has a slot in use.
 GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i, size_t count, gsf__vf columns[16]) {
+    const size_t row = GSF__SLOT_FLOATS;
     enum { WIDE = GSF__LANES / GSF__HALVES };
     uint32_t touched = 0;
     for (size_t l = 0; l < GSF__LANES; l++) {
@@ -8611,7 +8612,7 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
                 const size_t pair = r->splat_pairs[s];
                 if (!r->slot_used[pair]) continue;
                 const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
-                for (size_t k = 0; k < GSF__SLOT_FLOATS / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
+                for (size_t k = 0; k < row / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
                 touched |= 1u << l;
             }
         }
@@ -9824,7 +9825,7 @@ static void gsf__model_columns(const gsf__model* model, gsf__column out[GSF__COL
         const gsf__group* group = &model->groups[g];
         float* const arrays[4] = {group->value, group->m, group->v, group->grad};
         for (int k = 0; k < 4; k++) {
-            gsf__column* column = out + (k < 3 ? k * GSF__GROUPS : GSF__COLUMNS - GSF__GROUPS) + g;
+            gsf__column* column = out + (k < 3 ? k * GSF__GROUPS : (int)GSF__COLUMNS - (int)GSF__GROUPS) + g;
             column->data = (char*)arrays[k];
             column->row = group->width * sizeof(float);
         }
@@ -10081,7 +10082,7 @@ static void gsf__lazy_all_chunk(void* arg, size_t chunk, int32_t worker) { // br
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     (void)worker;
     const size_t end = gsf__model_blocks(gsf__model_chunk_end(lazy->model->count, chunk));
-    for (size_t b = chunk * (GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
+    for (size_t b = chunk * ((size_t)GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
 }
 
 // Writes up-to-date SH to the gradient buffer, which is free between steps, and leaves the model's SH unchanged.
@@ -10438,8 +10439,8 @@ static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
         const uint32_t most = GSF__MCMC_MOST, copies = model->visits[0][i] < most ? model->visits[0][i] + 1 : most;
         const double clear = 1.0 / (1.0 + gsf__exp_f64((double)*logit));
         double opacity;
-        const float grown = (float)gsf__log_f64(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
-                                                       &opacity));
+        const double shared = clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON;
+        const float grown = (float)gsf__log_f64(gsf__mcmc_share(shared, copies, &opacity));
         if (opacity < least_opacity) opacity = least_opacity;
         *logit = (float)gsf__log_f64(opacity / (1.0 - opacity));
         for (int a = 0; a < 3; a++) scale[a] += grown;
@@ -13394,7 +13395,7 @@ static double gsf__window_agreement(const gsf_restore_window* window) {
                 }
             }
     if (explained < 0.5 * pixels) return 0.0;
-    return error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
+    return error > 0.0 ? -10.0 * log10(error / weight) : (double)INFINITY;
 }
 
 // Restores the window, or skips it (*skip = 1) if its render already agrees with the photos.

@@ -434,7 +434,7 @@ static void gsf__traj_slerp(const double a[4], const double b[4], double t, doub
         apart += d * d;
         along += s * s;
     }
-    const double angle = 2.0 * gsf__atan2_f64(sqrt(apart), sqrt(along)); // at most a quarter turn, so sin(angle) is well conditioned
+    const double angle = 2.0 * gsf__atan2_f64(sqrt(apart), sqrt(along)); // at most a quarter turn: its sine is well conditioned
     double wa = 1.0 - t, wb = t;
     if (angle > 1e-9) {
         wa = gsf__sin_f64(angle * (1.0 - t)) / gsf__sin_f64(angle);
