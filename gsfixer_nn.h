@@ -18280,8 +18280,8 @@ static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, fl
     b->dv = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->k_across = gsf__nn_share(&arena, across);
     b->v_across = gsf__nn_share(&arena, across);
-    b->p = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
-    b->dp = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->p = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->dp = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->center = gsf__nn_share(&arena, pitch);
     b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
     return arena.used;

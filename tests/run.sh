@@ -19,7 +19,7 @@ started=$SECONDS
 
 packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev
     libglm-dev libopenimageio-dev libopenmpi-dev openmpi-bin python3
-    gcc-mingw-w64-x86-64-posix wine wine64 gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user emscripten)
+    gcc-mingw-w64-x86-64-posix wine wine64 gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user emscripten tcc)
 say() { printf '== %s\n' "$*"; }
 
 install_missing() {
