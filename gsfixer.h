@@ -41,8 +41,13 @@
                ctx->error and passed to the log hook. On error, outputs are zeroed or unchanged and nothing leaks.
    MEMORY      All memory comes from the context's allocator. The caller that makes an object destroys it with the same
                context.
-   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 17 KB; -O0: 31 KB), so threads
+   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 16 KB; -O0: 31 KB), so threads
                with 256 KB are enough.
+   PLATFORMS   64-bit Linux, Windows (MinGW-w64; file names are UTF-8 and may be longer than 260 characters), macOS, Arm with
+               NEON, WebAssembly with or without -msimd128. The compiler of Visual Studio gets the scalar kernels, clang-cl
+               those for AVX2 and AVX-512. Training with the scalar kernels gives the same bits on all of them, with any
+               compiler flags that keep IEEE 754 (not -ffast-math), as long as the rounding mode is the default, to nearest:
+               a host that changes it sets it back around calls.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
    NAMES       Functions are gsf_VERB_NOUN, in the modules gsf_traj_VERB_NOUN, gsf_splat_VERB_NOUN and gsf_nn_VERB_NOUN;
@@ -85,7 +90,7 @@
                         frame. gsf_splat_make_warp in gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
-   SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
+   SECTIONS    >>glm >>internals >>maths >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
                >>images >>resize >>metrics >>cameras >>clips >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
@@ -106,10 +111,15 @@
 #endif
 #endif
 
+#if defined(__MINGW32__) && defined(__GNUC__) && !defined(__clang__)
+#define GSF__PRINTF_KIND gnu_printf // the text functions use MinGW's own printf, not that of the C runtime, which has no %zu
+#else
+#define GSF__PRINTF_KIND printf
+#endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSF_NODISCARD __attribute__((warn_unused_result))
 #define GSF_RESTRICT __restrict__
-#define GSF_PRINTF(fmt, args) __attribute__((format(printf, fmt, args)))
+#define GSF_PRINTF(fmt, args) __attribute__((format(GSF__PRINTF_KIND, fmt, args)))
 #else
 #define GSF_NODISCARD
 #define GSF_RESTRICT __restrict
@@ -155,6 +165,7 @@ typedef enum gsf_cpu_level { // instruction sets that kernels may use; AUTO sele
     GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
     GSF_CPU_AVX512_VNNI = 4, // AVX512 and 8-bit dot products
     GSF_CPU_AVX512_BF16 = 5, // AVX512_VNNI and bfloat16 dot products
+    GSF_CPU_SIMD128 = 6,     // four lanes: NEON of 64-bit Arm, SIMD128 of WebAssembly (which is chosen when compiling)
 } gsf_cpu_level;
 
 typedef enum gsf_log_level { GSF_LOG_ERROR = 0, GSF_LOG_WARNING = 1, GSF_LOG_INFO = 2 } gsf_log_level;
@@ -220,7 +231,7 @@ GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
 GSF_API int32_t gsf_is_cancelled(const gsf_context* ctx);
 
-// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16").
+// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16", "simd128").
 GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
@@ -607,6 +618,20 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
+#if defined(_WIN32)
+#ifndef WIN32_LEAN_AND_MEAN
+#define WIN32_LEAN_AND_MEAN
+#endif
+#ifndef NOMINMAX
+#define NOMINMAX
+#endif
+#include <windows.h>
+#include <fcntl.h>
+#include <io.h>
+#elif defined(__unix__) || defined(__APPLE__)
+#include <sys/stat.h>
+#endif
 
 #ifndef GSF_ASSERT
 #include <assert.h>
@@ -620,9 +645,25 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__ALWAYS_INLINE
 #endif
 
-#if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
+// Kernels use target attributes and operators on vectors, which GCC and Clang (also as clang-cl) have; the compiler of
+// Visual Studio, which has neither in C, gets the scalar ones.
+#if !defined(GSF_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) && \
+    ((defined(__GNUC__) && !defined(__TINYC__)) || defined(__clang__))
 #define GSF__X86 1
 #include <immintrin.h>
+#if defined(_MSC_VER)
+#include <intrin.h>
+#else
+#include <cpuid.h>
+#endif
+#if defined(__MINGW32__) && !defined(__clang__)
+// The stack is aligned to 16 bytes only on Windows, and GCC does not align its own spills of wider registers there (GCC bug
+// 54412), so its aligned moves are assembled as unaligned ones, which are as fast.
+__asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
+        ".macro vmovaps args:vararg\nvmovups \\args\n.endm\n.macro vmovapd args:vararg\nvmovupd \\args\n.endm\n"
+        ".macro vmovdqa args:vararg\nvmovdqu \\args\n.endm\n.macro vmovdqa32 args:vararg\nvmovdqu32 \\args\n.endm\n"
+        ".macro vmovdqa64 args:vararg\nvmovdqu64 \\args\n.endm\n.endif");
+#endif
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
 #define GSF__INLINE_AVX2 GSF__TARGET_AVX2 GSF__ALWAYS_INLINE static inline
 #define GSF__AVX512 "avx2,fma,f16c,bmi,avx512f,avx512bw,avx512dq,avx512vl"
@@ -636,6 +677,20 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__X86 0
 #endif
 
+// Four lanes: NEON of 64-bit Arm, which always has it, or SIMD128 of WebAssembly (-msimd128).
+#if !defined(GSF_NO_SIMD) && defined(__aarch64__) && (defined(__GNUC__) || defined(__clang__))
+#define GSF__SIMD128 1
+#define GSF__NEON 1
+#include <arm_neon.h>
+#elif !defined(GSF_NO_SIMD) && defined(__wasm_simd128__)
+#define GSF__SIMD128 1
+#define GSF__NEON 0
+#include <wasm_simd128.h>
+#else
+#define GSF__SIMD128 0
+#define GSF__NEON 0
+#endif
+
 #ifdef _OPENMP
 #include <omp.h>
 #endif
@@ -647,7 +702,13 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__END_IMPLEMENTATION _Pragma("STDC FP_CONTRACT DEFAULT")
 #elif defined(__GNUC__)
 // g++ before 13 takes the operands that its AVX-512 intrinsics leave undefined for uninitialised variables (GCC bug 105593).
-#if defined(__cplusplus) && __GNUC__ < 13
+#if defined(__MINGW32__) // isfinite and isnan are macros that convert to float; rpcndr.h has a type named byte
+#define GSF__BEGIN_QUIET                                                                                \
+    _Pragma("GCC diagnostic push") _Pragma("GCC diagnostic ignored \"-Wfloat-conversion\"")             \
+        _Pragma("GCC diagnostic ignored \"-Wshadow\"") _Pragma("GCC diagnostic ignored \"-Wuninitialized\"") \
+            _Pragma("GCC diagnostic ignored \"-Wmaybe-uninitialized\"")
+#define GSF__END_QUIET _Pragma("GCC diagnostic pop")
+#elif defined(__cplusplus) && __GNUC__ < 13
 #define GSF__BEGIN_QUIET                                                                        \
     _Pragma("GCC diagnostic push") _Pragma("GCC diagnostic ignored \"-Wuninitialized\"")        \
         _Pragma("GCC diagnostic ignored \"-Wmaybe-uninitialized\"")
@@ -684,6 +745,24 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 
 #define GSF__COUNT(array) (sizeof(array) / sizeof((array)[0]))
 
+// Whether operations on doubles are rounded to double at once (not so on the x87).
+#if defined(FLT_EVAL_METHOD)
+#define GSF__PLAIN_DOUBLES (FLT_EVAL_METHOD == 0)
+#else
+#define GSF__PLAIN_DOUBLES 0
+#endif
+
+// MinGW's own, since the C runtime that it links has no %zu in some versions and rounds wrongly in others.
+#if defined(__MINGW32__)
+#define GSF__SNPRINTF __mingw_snprintf
+#define GSF__VSNPRINTF __mingw_vsnprintf
+#define GSF__STRTOD __mingw_strtod
+#else
+#define GSF__SNPRINTF snprintf
+#define GSF__VSNPRINTF vsnprintf
+#define GSF__STRTOD strtod
+#endif
+
 GSF__BEGIN_IMPLEMENTATION
 
 GSF__SHARED gsf_result gsf__check_cancel(gsf_context* ctx) {
@@ -714,16 +793,6 @@ GSF__SHARED gsf_result gsf__reserve(gsf_context* ctx, void** array, size_t* capa
     *array = fresh;
     *capacity = grown;
     return GSF_OK;
-}
-
-// The sRGB transfer function and its inverse; linear below 0.
-GSF__SHARED void gsf__transfer_colors(double* values, size_t count, gsf_color_space to) {
-    if (to == GSF_COLOR_SRGB)
-        for (size_t i = 0; i < count; i++)
-            values[i] = values[i] <= 0.0031308 ? 12.92 * values[i] : 1.055 * pow(values[i], 1.0 / 2.4) - 0.055;
-    else
-        for (size_t i = 0; i < count; i++)
-            values[i] = values[i] <= 0.04045 ? values[i] / 12.92 : pow((values[i] + 0.055) / 1.055, 2.4);
 }
 
 // Arrays that are freed together. gsf__arena_alloc returns NULL when out of memory and sets `failed`, so that one check
@@ -880,7 +949,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
     double result = 0.0;
     if (kept == 0) {
         result = 0.0;
-    } else if (FLT_EVAL_METHOD == 0 && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
+    } else if (GSF__PLAIN_DOUBLES && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
                exponent <= 22) { // both operands are exact, so the result is rounded once
         result = exponent < 0 ? (double)mantissa / powers[-exponent] : (double)mantissa * powers[exponent];
     } else {
@@ -891,7 +960,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
         if (exponent > 9999) exponent = 9999;
         if (exponent < -9999) exponent = -9999;
         snprintf(digits + kept, sizeof digits - kept, "e%d", (int)exponent);
-        result = strtod(digits, NULL);
+        result = GSF__STRTOD(digits, NULL);
     }
     *out = text[0] == '-' ? -result : result;
     return at;
@@ -1070,10 +1139,230 @@ GSF__SHARED gsf__carry_fn gsf__carry_fn_of(const gsf_restore_window* window) {
     return window->struct_size >= sizeof *window ? window->carry_fn : NULL;
 }
 
-// Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist either.
+// Result for the errno of a failed gsf__open_path. A path below a regular file (ENOTDIR) does not exist either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
+    if (reason == ENOMEM) return GSF_ERROR_OUT_OF_MEMORY;
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
+
+// ---- platform: clock, text, files. All paths are UTF-8; on failure the functions return -1 or NULL and set errno.
+
+typedef enum gsf__path_kind { GSF__PATH_UNKNOWN, GSF__PATH_FILE, GSF__PATH_FOLDER, GSF__PATH_DEVICE } gsf__path_kind;
+typedef enum gsf__open_mode { // WRITE is for devices; NEW fails if there is anything of that name, even a link
+    GSF__OPEN_READ, GSF__OPEN_WRITE, GSF__OPEN_NEW
+} gsf__open_mode;
+
+#if defined(_WIN32)
+
+GSF__SHARED double gsf__seconds(void) { // of a clock that only goes forward; for statistics only
+    LARGE_INTEGER ticks, per_second;
+    QueryPerformanceCounter(&ticks);
+    QueryPerformanceFrequency(&per_second);
+    return (double)ticks.QuadPart / (double)per_second.QuadPart;
+}
+
+GSF__SHARED int gsf__seek(FILE* file, int64_t offset, int from) { return _fseeki64(file, offset, from); }
+GSF__SHARED int64_t gsf__tell(FILE* file) { return _ftelli64(file); }
+
+GSF__SHARED int gsf__set_errno(DWORD reason) {
+    switch (reason) {
+        case ERROR_FILE_NOT_FOUND:
+        case ERROR_PATH_NOT_FOUND:
+        case ERROR_INVALID_NAME:
+        case ERROR_BAD_NETPATH:
+        case ERROR_INVALID_DRIVE: errno = ENOENT; break;
+        case ERROR_ACCESS_DENIED:
+        case ERROR_WRITE_PROTECT: errno = EACCES; break;
+        case ERROR_SHARING_VIOLATION:
+        case ERROR_LOCK_VIOLATION: errno = EBUSY; break;
+        case ERROR_FILE_EXISTS:
+        case ERROR_ALREADY_EXISTS: errno = EEXIST; break;
+        case ERROR_DISK_FULL:
+        case ERROR_HANDLE_DISK_FULL: errno = ENOSPC; break;
+        case ERROR_FILENAME_EXCED_RANGE: errno = ENAMETOOLONG; break;
+        case ERROR_DIRECTORY: errno = ENOTDIR; break;
+        default: errno = EIO;
+    }
+    return -1;
+}
+
+enum { GSF__SHORT_PATH = 240 }; // in UTF-16 units; longer ones need the form \\?\, which no other program has to understand
+
+typedef struct gsf__wide { // a path for the W functions
+    wchar_t* text; // NULL: it is not UTF-8, or memory is out (errno)
+    wchar_t* owned;
+    wchar_t inside[GSF__SHORT_PATH + 1];
+} gsf__wide;
+
+GSF__SHARED void gsf__free_wide(gsf_context* ctx, gsf__wide* wide) { // keeps errno and the system's last error
+    const int reason = errno;
+    const DWORD last = GetLastError();
+    gsf_free(ctx, wide->owned);
+    SetLastError(last);
+    errno = reason;
+}
+
+// The absolute path in the form \\?\, after 8 units that the prefix may need.
+GSF__SHARED void gsf__lengthen_path(gsf_context* ctx, const wchar_t* path, gsf__wide* out) {
+    const DWORD room = GetFullPathNameW(path, 0, NULL, NULL); // with the zero
+    errno = ENOMEM;
+    out->owned = (wchar_t*)gsf_alloc(ctx, (size_t)room + 8, sizeof *out->owned);
+    const DWORD used = out->owned ? GetFullPathNameW(path, room, out->owned + 8, NULL) : 0;
+    if (used == 0 || used >= room) return;
+    const wchar_t* full = out->owned + 8;
+    const int network = full[0] == L'\\' && full[1] == L'\\'; // \\server\share becomes \\?\UNC\server\share
+    const size_t length = network ? 7 : 4;
+    memmove(out->owned + length, full + network, ((size_t)used + 1 - (size_t)network) * sizeof *full);
+    memcpy(out->owned, network ? L"\\\\?\\UNC" : L"\\\\?\\", length * sizeof *full);
+    out->text = out->owned;
+}
+
+GSF__SHARED void gsf__widen_path(gsf_context* ctx, const char* path, gsf__wide* out) { // end with gsf__free_wide
+    out->text = out->owned = NULL;
+    const int size = MultiByteToWideChar(CP_UTF8, MB_ERR_INVALID_CHARS, path, -1, NULL, 0);
+    errno = ENOENT; // no file can have such a name
+    if (size < 1) return;
+    wchar_t* long_path = NULL;
+    wchar_t* wide = out->inside;
+    if (size > GSF__SHORT_PATH) {
+        errno = ENOMEM;
+        wide = long_path = (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide);
+        if (!wide) return;
+    }
+    MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, size);
+    const int verbatim = wide[0] == L'\\' && wide[1] == L'\\' && (wide[2] == L'?' || wide[2] == L'.');
+    if (verbatim || GetFullPathNameW(wide, 0, NULL, NULL) <= GSF__SHORT_PATH) { // a long one may become short: a/../b
+        out->text = wide;
+        out->owned = long_path;
+        return;
+    }
+    gsf__lengthen_path(ctx, wide, out);
+    gsf_free(ctx, long_path);
+}
+
+GSF__SHARED gsf__path_kind gsf__look_at_path(gsf_context* ctx, const char* path) {
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
+    if (!wide.text) return gsf__free_wide(ctx, &wide), GSF__PATH_UNKNOWN;
+    const DWORD attributes = GetFileAttributesW(wide.text);
+    gsf__path_kind kind = GSF__PATH_UNKNOWN;
+    HANDLE file = INVALID_HANDLE_VALUE;
+    if (attributes != INVALID_FILE_ATTRIBUTES && (attributes & FILE_ATTRIBUTE_DIRECTORY)) kind = GSF__PATH_FOLDER;
+    else
+        file = CreateFileW(wide.text, 0, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, OPEN_EXISTING, 0, NULL);
+    if (file != INVALID_HANDLE_VALUE) {
+        kind = GetFileType(file) == FILE_TYPE_DISK ? GSF__PATH_FILE : GSF__PATH_DEVICE;
+        CloseHandle(file);
+    }
+    gsf__free_wide(ctx, &wide);
+    return kind;
+}
+
+// Waits before a file that somebody else has open is tried again; about a second in all. Returns 0 when that is over.
+GSF__SHARED int gsf__wait_for_path(int attempt) {
+    if (attempt >= 40) return 0;
+    Sleep(attempt < 8 ? 2 : 30);
+    return 1;
+}
+
+// Others may read, replace and remove the file meanwhile, as on other platforms.
+GSF__SHARED HANDLE gsf__open_handle(gsf_context* ctx, const char* path, DWORD access, DWORD how, DWORD flags) {
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
+    HANDLE file = INVALID_HANDLE_VALUE;
+    for (int attempt = 0; wide.text; attempt++) {
+        file = CreateFileW(wide.text, access, FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL, how, flags, NULL);
+        const DWORD reason = GetLastError();
+        if (file != INVALID_HANDLE_VALUE) break;
+        gsf__set_errno(reason);
+        if (reason != ERROR_SHARING_VIOLATION || !gsf__wait_for_path(attempt)) break;
+    }
+    gsf__free_wide(ctx, &wide);
+    return file;
+}
+
+GSF__SHARED FILE* gsf__open_path(gsf_context* ctx, const char* path, gsf__open_mode mode) {
+    const int reads = mode == GSF__OPEN_READ;
+    HANDLE handle = gsf__open_handle(ctx, path, reads ? GENERIC_READ : GENERIC_WRITE, mode == GSF__OPEN_NEW ? CREATE_NEW :
+                                     OPEN_EXISTING, FILE_ATTRIBUTE_NORMAL);
+    if (handle == INVALID_HANDLE_VALUE) return NULL;
+    const int descriptor = _open_osfhandle((intptr_t)handle, reads ? _O_RDONLY | _O_BINARY : _O_BINARY);
+    FILE* file = descriptor < 0 ? NULL : _fdopen(descriptor, reads ? "rb" : "wb");
+    if (!file && descriptor >= 0) _close(descriptor);
+    else if (!file) CloseHandle(handle);
+    return file;
+}
+
+// A virus scanner or a reader of the old file makes it fail for a moment, in which the old file stays as it is.
+GSF__SHARED int gsf__replace_path(gsf_context* ctx, const char* from, const char* to) {
+    gsf__wide wide_from, wide_to;
+    gsf__widen_path(ctx, from, &wide_from);
+    gsf__widen_path(ctx, to, &wide_to);
+    int result = -1;
+    for (int attempt = 0; wide_from.text && wide_to.text && result != 0; attempt++) {
+        if (MoveFileExW(wide_from.text, wide_to.text, MOVEFILE_REPLACE_EXISTING | MOVEFILE_WRITE_THROUGH)) result = 0;
+        const DWORD reason = GetLastError();
+        if (result == 0) break;
+        gsf__set_errno(reason);
+        const DWORD there = GetFileAttributesW(wide_to.text); // a folder or a protected file will not give way
+        const int lasting = there != INVALID_FILE_ATTRIBUTES && (there & (FILE_ATTRIBUTE_DIRECTORY | FILE_ATTRIBUTE_READONLY));
+        if ((reason != ERROR_SHARING_VIOLATION && reason != ERROR_ACCESS_DENIED) || lasting || !gsf__wait_for_path(attempt))
+            break;
+    }
+    gsf__free_wide(ctx, &wide_from);
+    gsf__free_wide(ctx, &wide_to);
+    return result;
+}
+
+GSF__SHARED void gsf__remove_path(gsf_context* ctx, const char* path) {
+    gsf__wide wide;
+    gsf__widen_path(ctx, path, &wide);
+    if (wide.text) DeleteFileW(wide.text);
+    gsf__free_wide(ctx, &wide);
+}
+
+#else
+
+GSF__SHARED double gsf__seconds(void) { // for statistics only
+#ifdef TIME_UTC
+    struct timespec t;
+    return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
+#else
+    return (double)clock() / (double)CLOCKS_PER_SEC;
+#endif
+}
+
+GSF__SHARED int gsf__seek(FILE* file, int64_t offset, int from) { return fseek(file, (long)offset, from); }
+GSF__SHARED int64_t gsf__tell(FILE* file) { return ftell(file); }
+
+GSF__SHARED gsf__path_kind gsf__look_at_path(gsf_context* ctx, const char* path) {
+    (void)ctx;
+#if defined(__unix__) || defined(__APPLE__)
+    struct stat info;
+    if (stat(path, &info) != 0) return GSF__PATH_UNKNOWN;
+    return S_ISREG(info.st_mode) ? GSF__PATH_FILE : S_ISDIR(info.st_mode) ? GSF__PATH_FOLDER : GSF__PATH_DEVICE;
+#else
+    (void)path;
+    return GSF__PATH_UNKNOWN;
+#endif
+}
+
+GSF__SHARED FILE* gsf__open_path(gsf_context* ctx, const char* path, gsf__open_mode mode) {
+    (void)ctx;
+    return fopen(path, mode == GSF__OPEN_READ ? "rb" : mode == GSF__OPEN_WRITE ? "wb" : "wbx");
+}
+
+GSF__SHARED int gsf__replace_path(gsf_context* ctx, const char* from, const char* to) {
+    (void)ctx;
+    return rename(from, to);
+}
+
+GSF__SHARED void gsf__remove_path(gsf_context* ctx, const char* path) {
+    (void)ctx;
+    remove(path);
+}
+
+#endif
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
@@ -1192,6 +1481,211 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == ctx->services->read_fn || ctx->io.plain_files;
 }
 
+// ---- >>maths: functions with the same bits everywhere -----------------------------
+
+/* The C libraries of Linux, Windows, Arm and the browsers differ in the last bits of exp, log, sin and so on, and glibc's in
+   those of machines with and without FMA. What a scene's training depends on is therefore computed here, by additions,
+   multiplications, divisions and sqrt, which IEEE 754 defines to the bit. Errors are below 1 ulp of double unless a comment
+   says otherwise; the rounding mode has to be the default (to nearest). */
+
+#define GSF__LN2_HIGH 0.693147180369123816490 // its last 32 bits are 0: a product with an exponent is exact
+#define GSF__LN2_LOW 1.90821492927058770002e-10
+#define GSF__TO_INT 6755399441055744.0        // 1.5 * 2^52: added and subtracted, it rounds to the nearest integer
+
+GSF__SHARED double gsf__power_of_2(int n) { // -1022 <= n <= 1023
+    const uint64_t bits = (uint64_t)(n + 1023) << 52;
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+// 1 + r + r^2/2 + ... for |r| <= ln(2)/2, without its first term.
+GSF__SHARED double gsf__exp_series(double r) {
+    double p = 1.0 / 6227020800.0;
+    p = p * r + 1.0 / 479001600.0;
+    p = p * r + 1.0 / 39916800.0;
+    p = p * r + 1.0 / 3628800.0;
+    p = p * r + 1.0 / 362880.0;
+    p = p * r + 1.0 / 40320.0;
+    p = p * r + 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    return p * r * r + r;
+}
+
+GSF__SHARED double gsf__exp_f64(double x) {
+    if (!(x < 710.0)) return x != x ? x : (double)INFINITY;
+    if (x < -746.0) return 0.0;
+    const double n = x * 1.44269504088896338700 + GSF__TO_INT - GSF__TO_INT;
+    const double high = x - n * GSF__LN2_HIGH, low = n * GSF__LN2_LOW, r = high - low;
+    const double p = 1.0 + (gsf__exp_series(r) + ((high - r) - low));
+    const int k = (int)n, half = k / 2;
+    return p * gsf__power_of_2(half) * gsf__power_of_2(k - half); // in two steps: 2^k may be subnormal
+}
+
+GSF__SHARED double gsf__expm1_f64(double x) {
+    return fabs(x) < 0.34 ? gsf__exp_series(x) : gsf__exp_f64(x) - 1.0;
+}
+
+// log(x + low), where low is negligible next to x but for the last bits.
+GSF__SHARED double gsf__log_sum(double x, double low) {
+    if (!(x > 0.0) || x > DBL_MAX) return x == 0.0 ? -(double)INFINITY : x > 0.0 || x != x ? x : (double)NAN;
+    int64_t bits;
+    int shift = 0;
+    if (x < DBL_MIN) x *= 18014398509481984.0, low *= 18014398509481984.0, shift = 54;
+    memcpy(&bits, &x, sizeof bits);
+    const int64_t k = (bits - 0x3fe6a09e667f3bcd) >> 52; // from sqrt(1/2): the mantissa ends up in [sqrt(1/2), sqrt(2))
+    bits -= k * ((int64_t)1 << 52);
+    double m;
+    memcpy(&m, &bits, sizeof m);
+    const double f = m - 1.0, n = (double)(k - shift), s = f / (2.0 + f), z = s * s; // log(m) = 2 artanh(s)
+    double p = 2.0 / 25.0;
+    p = p * z + 2.0 / 23.0;
+    p = p * z + 2.0 / 21.0;
+    p = p * z + 2.0 / 19.0;
+    p = p * z + 2.0 / 17.0;
+    p = p * z + 2.0 / 15.0;
+    p = p * z + 2.0 / 13.0;
+    p = p * z + 2.0 / 11.0;
+    p = p * z + 2.0 / 9.0;
+    p = p * z + 2.0 / 7.0;
+    p = p * z + 2.0 / 5.0;
+    p = p * z + 2.0 / 3.0;
+    const double half = 0.5 * f * f;
+    return n * GSF__LN2_HIGH - ((half - (s * (half + p * z) + (n * GSF__LN2_LOW + low / x))) - f);
+}
+
+GSF__SHARED double gsf__log_f64(double x) { return gsf__log_sum(x, 0.0); }
+
+GSF__SHARED double gsf__log1p_f64(double x) {
+    const double sum = 1.0 + x;
+    if (sum == 1.0) return x;
+    return gsf__log_sum(sum, fabs(x) < 1.0 ? x - (sum - 1.0) : 1.0 - (sum - x));
+}
+
+// x^n by squaring; the relative error grows with n, to n ulp at most.
+GSF__SHARED double gsf__power_f64(double x, uint64_t n) {
+    double power = 1.0;
+    for (; n; n >>= 1, x *= x)
+        if (n & 1u) power *= x;
+    return power;
+}
+
+// The multiple of pi/2 next to x, and the rest as a sum. Beyond a million the result is less exact than a double.
+GSF__SHARED int gsf__quadrant(double x, double* rest, double* low) {
+    const double n = x * 0.636619772367581382433 + GSF__TO_INT - GSF__TO_INT;
+    const double r = x - n * 1.57079632673412561417, w = n * 6.07710050630396597660e-11; // 33 bits each: exact
+    const double s = r - w, v = n * 2.02226624879595063154e-21 - ((r - s) - w);
+    *rest = s - v;
+    *low = (s - *rest) - v;
+    return (int)((int64_t)n & 3);
+}
+
+GSF__SHARED double gsf__sin_series(double x, double low) { // |x| <= pi/4
+    const double z = x * x;
+    double p = 1.0 / 355687428096000.0;
+    p = 1.0 / 1307674368000.0 - p * z;
+    p = 1.0 / 6227020800.0 - p * z;
+    p = 1.0 / 39916800.0 - p * z;
+    p = 1.0 / 362880.0 - p * z;
+    p = 1.0 / 5040.0 - p * z;
+    p = 1.0 / 120.0 - p * z;
+    p = 1.0 / 6.0 - p * z;
+    return x - (p * z * x - low * (1.0 - 0.5 * z));
+}
+
+GSF__SHARED double gsf__cos_series(double x, double low) { // |x| <= pi/4
+    const double z = x * x, half = 0.5 * z, rest = 1.0 - half;
+    double p = 1.0 / 6402373705728000.0;
+    p = 1.0 / 20922789888000.0 - p * z;
+    p = 1.0 / 87178291200.0 - p * z;
+    p = 1.0 / 479001600.0 - p * z;
+    p = 1.0 / 3628800.0 - p * z;
+    p = 1.0 / 40320.0 - p * z;
+    p = 1.0 / 720.0 - p * z;
+    p = 1.0 / 24.0 - p * z;
+    return rest + (((1.0 - rest) - half) + (p * z * z - x * low));
+}
+
+GSF__SHARED double gsf__turn(double x, int quarters) { // sin(x + quarters * pi/2)
+    double rest, low;
+    if (!(fabs(x) < 1e9)) return x != x || fabs(x) > DBL_MAX ? (double)NAN : 0.0;
+    const int quadrant = (gsf__quadrant(x, &rest, &low) + quarters) & 3;
+    const double value = quadrant & 1 ? gsf__cos_series(rest, low) : gsf__sin_series(rest, low);
+    return quadrant & 2 ? -value : value;
+}
+
+// Of arguments below 1e9, beyond which they have no use here (and are 0).
+GSF__SHARED double gsf__sin_f64(double x) { return gsf__turn(x, 0); }
+GSF__SHARED double gsf__cos_f64(double x) { return gsf__turn(x, 1); }
+GSF__SHARED double gsf__tan_f64(double x) { return gsf__turn(x, 0) / gsf__turn(x, 1); } // to 2 ulp
+
+GSF__SHARED double gsf__atan_unit(double x) { // 0 <= x <= 1; to 1.5 ulp
+    static const double centers[3] = {0.0, 0.5, 1.0};
+    static const double angles[3] = {0.0, 4.63647609000806093515e-01, 7.85398163397448278999e-01};
+    static const double rests[3] = {0.0, 2.26987774529616870924e-17, 3.06161699786838301793e-17};
+    const int k = x < 0.25 ? 0 : x < 0.75 ? 1 : 2;
+    const double t = (x - centers[k]) / (1.0 + x * centers[k]), z = t * t; // |t| <= 1/4
+    double p = 1.0 / 27.0;
+    for (int i = 25; i >= 3; i -= 2) p = 1.0 / (double)i - p * z;
+    return angles[k] + (t - (p * z * t - rests[k]));
+}
+
+GSF__SHARED double gsf__atan2_f64(double y, double x) { // to 2 ulp; 0 for two zeros
+    const double ax = fabs(x), ay = fabs(y), most = ax > ay ? ax : ay, least = ax > ay ? ay : ax;
+    if (x != x || y != y) return x + y;
+    double angle = most > 0.0 && least < (double)INFINITY ? gsf__atan_unit(least / most) : 0.0;
+    if (ay > ax) angle = 1.57079632679489655800 - (angle - 6.12323399573676603587e-17);
+    if (x < 0.0) angle = 3.14159265358979311600 - (angle - 1.2246467991473531772e-16);
+    return y < 0.0 ? -angle : angle;
+}
+
+GSF__SHARED double gsf__acos_f64(double x) { // to 3 ulp
+    return x != x ? x : 2.0 * gsf__atan2_f64(sqrt(x < 1.0 ? 1.0 - x : 0.0), sqrt(x > -1.0 ? 1.0 + x : 0.0));
+}
+
+GSF__SHARED double gsf__cbrt_f64(double x) { // to 2 ulp
+    if (!(fabs(x) > 0.0) || fabs(x) > DBL_MAX) return x;
+    const double a = fabs(x);
+    double root = gsf__exp_f64(gsf__log_f64(a) / 3.0);
+    root -= (root * root * root - a) / (3.0 * root * root);
+    return x < 0.0 ? -root : root;
+}
+
+// Of floats: rounded from double, and so nearly always correctly.
+GSF__SHARED float gsf__exp_f32(float x) { return (float)gsf__exp_f64((double)x); }
+GSF__SHARED float gsf__log_f32(float x) { return (float)gsf__log_f64((double)x); }
+
+GSF__SHARED double gsf__pow_f64(double x, double y) { return gsf__exp_f64(gsf__log_f64(x) * y); } // x > 0
+
+// The sRGB transfer function and its inverse; linear below 0.
+GSF__SHARED void gsf__transfer_colors(double* values, size_t count, gsf_color_space to) {
+    for (size_t i = 0; i < count; i++) {
+        const double v = values[i];
+        if (to == GSF_COLOR_SRGB) values[i] = v <= 0.0031308 ? 12.92 * v : 1.055 * gsf__pow_f64(v, 1.0 / 2.4) - 0.055;
+        else values[i] = v <= 0.04045 ? v / 12.92 : gsf__pow_f64((v + 0.055) / 1.055, 2.4);
+    }
+}
+
+GSF__SHARED float gsf__exp2_f32(float x) {
+    if (!(x < 128.0f)) return x != x ? x : INFINITY;
+    if (x < -150.0f) return 0.0f;
+    const double n = (double)x + GSF__TO_INT - GSF__TO_INT, r = ((double)x - n) * 0.69314718055994530942;
+    double p = 1.0 / 3628800.0; // to 1e-12: |r| <= ln(2)/2
+    p = p * r + 1.0 / 362880.0;
+    p = p * r + 1.0 / 40320.0;
+    p = p * r + 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    return (float)((p * r * r + r + 1.0) * gsf__power_of_2((int)n));
+}
+
 // ---- >>lanes: the vector vocabulary --------------------------------------------
 
 /* An elementwise kernel is written once, in terms of the names below, and compiled once per instruction set: its header
@@ -1203,6 +1697,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
        #define GSF__KERNELS "gsfixer_x.h"       // the file with the kernels
        #define GSF__KERNELS_BLUR                // the section to compile
        #define GSF__KERNELS_AVX512              // optional: compile a 16-lane copy, too
+       #define GSF__KERNELS_SIMD128             // optional: compile a 4-lane copy for Arm and WebAssembly
        #include "gsfixer.h"                     // includes gsfixer_x.h once per instruction set
        #undef GSF__KERNELS_BLUR
        #endif
@@ -1220,7 +1715,8 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
    Names       gsf__v_ operates on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the other types. + - * / work on gsf__vf and
                gsf__vd, which are plain float and double or vector types for which GCC and Clang define operators (another
                compiler would need C++ overloads). No other vector extension is used.
-   madd        a * b + c; msub: a * b - c; nmadd: c - a * b. Fused, except in the scalar version.
+   madd        a * b + c; msub: a * b - c; nmadd: c - a * b. Fused if GSF__FUSED, that is, except in the scalar version and on
+               WebAssembly, which has no such instruction.
    min, max    return b if either operand is a NaN: max(limit, x) propagates a NaN in x, max(x, limit) replaces it.
    _first      reads or writes only the first n lanes (all if n >= GSF__LANES); other lanes are loaded as 0.
    sum         adds the upper half to the lower until one lane is left; 8 lanes: ((0+4)+(2+6)) + ((1+5)+(3+7)).
@@ -1235,15 +1731,23 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define GSF__V_INLINE GSF__V(GSF__V_INLINE)        // begins the definition of a function to be inlined into kernels
 #define GSF__LANES GSF__V(GSF__LANES)
 #define GSF__HALVES GSF__V(GSF__HALVES)
+#define GSF__FUSED GSF__V(GSF__FUSED)
 
-// The copy of a kernel, or of a constant, for a CPU level; WIDE: of one that has an AVX-512 copy.
+// The copy of a kernel, or of a constant, for a CPU level; LANE: of one that has a 4-lane copy; WIDE: of one that also has an
+// AVX-512 copy.
 #if GSF__X86
 #define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__WIDE_KERNEL_OF(level, name) \
     ((level) >= GSF_CPU_AVX512 ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
+#define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
+#elif GSF__SIMD128
+#define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
+#define GSF__WIDE_KERNEL_OF GSF__LANE_KERNEL_OF
+#define GSF__LANE_KERNEL_OF(level, name) ((level) == GSF_CPU_SIMD128 ? name##_simd128 : name##_scalar)
 #else
 #define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
 #define GSF__WIDE_KERNEL_OF GSF__KERNEL_OF
+#define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
 #endif
 
 #define gsf__vf GSF__V(gsf__vf)
@@ -1326,6 +1830,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 
 #define GSF__LANES_scalar 1
 #define GSF__HALVES_scalar 1
+#define GSF__FUSED_scalar 0
 #define GSF__V_KERNEL_scalar
 #define GSF__V_INLINE_scalar GSF__ALWAYS_INLINE GSF__SHARED inline
 
@@ -1427,6 +1932,7 @@ GSF__SHARED inline double gsf__vd_sum_scalar(double x) { return x; }
 
 #define GSF__LANES_avx2 8
 #define GSF__HALVES_avx2 2
+#define GSF__FUSED_avx2 1
 #define GSF__V_KERNEL_avx2 GSF__TARGET_AVX2
 #define GSF__V_INLINE_avx2 GSF__INLINE_AVX2
 
@@ -1579,6 +2085,7 @@ GSF__INLINE_AVX2 double gsf__vd_sum_avx2(__m256d v) {
 
 #define GSF__LANES_avx512 16
 #define GSF__HALVES_avx512 2
+#define GSF__FUSED_avx512 1
 #define GSF__V_KERNEL_avx512 GSF__TARGET_AVX512
 #define GSF__V_INLINE_avx512 GSF__INLINE_AVX512
 
@@ -1725,7 +2232,301 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 
 #endif // GSF__X86
 
-// Powers, in terms of the vocabulary. The scalar versions, which have no FMA, call libm.
+#if GSF__SIMD128
+
+// Four lanes, in terms of GCC's and Clang's vectors where their operators do the same on all processors.
+
+#define GSF__LANES_simd128 4
+#define GSF__HALVES_simd128 2
+#define GSF__FUSED_simd128 GSF__NEON
+#define GSF__V_KERNEL_simd128
+#define GSF__V_INLINE_simd128 GSF__ALWAYS_INLINE GSF__SHARED inline
+#define GSF__INLINE_SIMD128 GSF__V_INLINE_simd128
+
+#if GSF__NEON
+typedef float32x4_t gsf__vf_simd128;
+typedef int32x4_t gsf__vi_simd128;
+typedef float64x2_t gsf__vd_simd128;
+#else
+typedef float gsf__vf_simd128 __attribute__((vector_size(16)));
+typedef int32_t gsf__vi_simd128 __attribute__((vector_size(16)));
+typedef double gsf__vd_simd128 __attribute__((vector_size(16)));
+#endif
+typedef gsf__vi_simd128 gsf__vm_simd128; // each lane has all bits set or none
+typedef uint32_t gsf__vu_simd128 __attribute__((vector_size(16)));
+
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_set_simd128(int32_t x) {
+    const gsf__vi_simd128 v = {x, x, x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_index_simd128(void) {
+    const gsf__vi_simd128 v = {0, 1, 2, 3};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_load_simd128(const int32_t* p) {
+    gsf__vi_simd128 v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__vi_store_simd128(int32_t* p, gsf__vi_simd128 x) { memcpy(p, &x, sizeof x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_gather_simd128(const uint32_t* p, gsf__vi_simd128 i) {
+    const gsf__vi_simd128 v = {(int32_t)p[i[0]], (int32_t)p[i[1]], (int32_t)p[i[2]], (int32_t)p[i[3]]};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_byte_simd128(gsf__vi_simd128 x, int k) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)x >> (uint32_t)(8 * k) & 255u);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_add_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a + (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_sub_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a - (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_mul_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)a * (gsf__vu_simd128)b);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_shl_simd128(gsf__vi_simd128 x, int by) {
+    return (gsf__vi_simd128)((gsf__vu_simd128)x << (uint32_t)by);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_sar_simd128(gsf__vi_simd128 x, int by) { return x >> by; }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_keep_simd128(gsf__vm_simd128 mask, gsf__vi_simd128 x) { return mask & x; }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_as_floats_simd128(gsf__vi_simd128 bits) { return (gsf__vf_simd128)bits; }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_bits_simd128(gsf__vf_simd128 x) { return (gsf__vi_simd128)x; }
+
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_first_simd128(size_t n) {
+    return (gsf__vm_simd128)(gsf__vi_index_simd128() < gsf__vi_set_simd128(n < 4 ? (int32_t)n : 4));
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_of_bits_simd128(uint32_t bits) {
+    const gsf__vi_simd128 bit = {1, 2, 4, 8};
+    return (gsf__vm_simd128)((gsf__vi_set_simd128((int32_t)bits) & bit) == bit);
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_and_simd128(gsf__vm_simd128 a, gsf__vm_simd128 b) { return a & b; }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_or_simd128(gsf__vm_simd128 a, gsf__vm_simd128 b) { return a | b; }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__vm_not_simd128(gsf__vm_simd128 mask) { return ~mask; }
+
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_set_simd128(float x) {
+    const gsf__vf_simd128 v = {x, x, x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_simd128(const float* p) {
+    gsf__vf_simd128 v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__v_store_simd128(float* p, gsf__vf_simd128 x) { memcpy(p, &x, sizeof x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_first_simd128(const float* p, size_t n) {
+    if (n >= 4) return gsf__v_load_simd128(p);
+    const gsf__vf_simd128 v = {n > 0 ? p[0] : 0.0f, n > 1 ? p[1] : 0.0f, n > 2 ? p[2] : 0.0f, 0.0f};
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__v_store_first_simd128(float* p, gsf__vf_simd128 x, size_t n) {
+    if (n >= 4) {
+        gsf__v_store_simd128(p, x);
+        return;
+    }
+    if (n > 0) p[0] = x[0];
+    if (n > 1) p[1] = x[1];
+    if (n > 2) p[2] = x[2];
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_gather_simd128(const float* p, gsf__vi_simd128 i) {
+    const gsf__vf_simd128 v = {p[i[0]], p[i[1]], p[i[2]], p[i[3]]};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_load_bytes_simd128(const uint8_t* p, size_t n) {
+    const gsf__vf_simd128 v = {n > 0 ? (float)p[0] : 0.0f, n > 1 ? (float)p[1] : 0.0f, n > 2 ? (float)p[2] : 0.0f,
+                               n > 3 ? (float)p[3] : 0.0f};
+    return v;
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_eq_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a == b);
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_lt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a < b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_le_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a <= b);
+}
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_gt_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return (gsf__vm_simd128)(a > b); }
+GSF__INLINE_SIMD128 gsf__vm_simd128 gsf__v_ge_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vm_simd128)(a >= b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_keep_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)(mask & (gsf__vi_simd128)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_abs_simd128(gsf__vf_simd128 x) {
+    return gsf__v_keep_simd128(gsf__vi_set_simd128(0x7fffffff), x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_with_sign_simd128(gsf__vf_simd128 x, gsf__vf_simd128 of) {
+    return (gsf__vf_simd128)((gsf__vi_simd128)x ^ ((gsf__vi_simd128)of & gsf__vi_set_simd128(-0x7fffffff - 1)));
+}
+GSF__INLINE_SIMD128 void gsf__v_pin_simd128(gsf__vf_simd128* v) { (void)v; }
+GSF__INLINE_SIMD128 void gsf__v_fetch_simd128(const float* p) { __builtin_prefetch(p); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_set_simd128(double x) {
+    const gsf__vd_simd128 v = {x, x};
+    return v;
+}
+GSF__INLINE_SIMD128 double gsf__vd_sum_simd128(gsf__vd_simd128 x) { return x[0] + x[1]; }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_load_simd128(const float* p) {
+    const gsf__vd_simd128 v = {(double)p[0], (double)p[1]};
+    return v;
+}
+
+#if GSF__NEON
+
+GSF__INLINE_SIMD128 uint32_t gsf__vm_bits_simd128(gsf__vm_simd128 mask) {
+    const uint32x4_t bit = {1, 2, 4, 8};
+    return vaddvq_u32(vandq_u32(vreinterpretq_u32_s32(mask), bit));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_madd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmaq_f32(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_msub_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmaq_f32(vnegq_f32(c), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_nmadd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return vfmsq_f32(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_select_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 yes, gsf__vf_simd128 no) {
+    return vbslq_f32(vreinterpretq_u32_s32(mask), yes, no);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_min_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return vbslq_f32(vcltq_f32(a, b), a, b); // Arm's own minimum propagates a NaN in either operand
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_max_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return vbslq_f32(vcgtq_f32(a, b), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) { return vsqrtq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) { return vrndnq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) { return vrndmq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) { return vrndpq_f32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_to_int_simd128(gsf__vf_simd128 x) { return vcvtnq_s32_f32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_truncate_simd128(gsf__vf_simd128 x) { return vcvtq_s32_f32(x); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_floats_simd128(gsf__vi_simd128 x) { return vcvtq_f32_s32(x); }
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_min_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) { return vminq_s32(a, b); }
+GSF__INLINE_SIMD128 float gsf__v_sum_simd128(gsf__vf_simd128 v) {
+    return vaddv_f32(vadd_f32(vget_low_f32(v), vget_high_f32(v)));
+}
+GSF__INLINE_SIMD128 float gsf__v_largest_simd128(gsf__vf_simd128 v) { return vmaxvq_f32(v); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_low_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vzip1q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_high_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vzip2q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_half_simd128(gsf__vf_simd128 v, int h) {
+    return h ? vcvt_high_f64_f32(v) : vcvt_f64_f32(vget_low_f32(v));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vd_floats_simd128(const gsf__vd_simd128 halves[2]) {
+    return vcvt_high_f32_f64(vcvt_f32_f64(halves[0]), halves[1]);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_madd_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b, gsf__vd_simd128 c) {
+    return vfmaq_f64(c, a, b);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) { return vsqrtq_f64(x); }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_max_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b) {
+    return vbslq_f64(vcgtq_f64(a, b), a, b);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_keep_above_simd128(gsf__vd_simd128 a, gsf__vd_simd128 limit, gsf__vd_simd128 x) {
+    return vbslq_f64(vcgtq_f64(a, limit), x, gsf__vd_set_simd128(0.0));
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_add_folded_simd128(gsf__vd_simd128 sum, gsf__vf_simd128 v) {
+    return sum + vcvt_f64_f32(vadd_f32(vget_low_f32(v), vget_high_f32(v)));
+}
+
+#else // WebAssembly
+
+GSF__INLINE_SIMD128 uint32_t gsf__vm_bits_simd128(gsf__vm_simd128 mask) { return (uint32_t)wasm_i32x4_bitmask((v128_t)mask); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_madd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return a * b + c;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_msub_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return a * b - c;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_nmadd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b, gsf__vf_simd128 c) {
+    return c - a * b;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_select_simd128(gsf__vm_simd128 mask, gsf__vf_simd128 yes, gsf__vf_simd128 no) {
+    return (gsf__vf_simd128)wasm_v128_bitselect((v128_t)yes, (v128_t)no, (v128_t)mask);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_min_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vf_simd128)wasm_f32x4_pmin((v128_t)b, (v128_t)a); // a < b ? a : b
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_max_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return (gsf__vf_simd128)wasm_f32x4_pmax((v128_t)b, (v128_t)a); // b < a ? a : b
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_sqrt_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_sqrt((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_round_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_nearest((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_floor_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_floor((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_ceil_simd128(gsf__vf_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_ceil((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_truncate_simd128(gsf__vf_simd128 x) {
+    return (gsf__vi_simd128)wasm_i32x4_trunc_sat_f32x4((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__v_to_int_simd128(gsf__vf_simd128 x) {
+    return gsf__v_truncate_simd128(gsf__v_round_simd128(x));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vi_floats_simd128(gsf__vi_simd128 x) {
+    return (gsf__vf_simd128)wasm_f32x4_convert_i32x4((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vi_simd128 gsf__vi_min_simd128(gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    return (gsf__vi_simd128)wasm_i32x4_min((v128_t)a, (v128_t)b);
+}
+GSF__INLINE_SIMD128 float gsf__v_sum_simd128(gsf__vf_simd128 v) { return (v[0] + v[2]) + (v[1] + v[3]); }
+GSF__INLINE_SIMD128 float gsf__v_largest_simd128(gsf__vf_simd128 v) {
+    const float a = v[0] > v[2] ? v[0] : v[2], b = v[1] > v[3] ? v[1] : v[3];
+    return a > b ? a : b;
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_low_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 0, 4, 1, 5);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__v_mix_high_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 2, 6, 3, 7);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_half_simd128(gsf__vf_simd128 v, int h) {
+    const gsf__vf_simd128 half = h ? __builtin_shufflevector(v, v, 2, 3, 2, 3) : v;
+    return (gsf__vd_simd128)wasm_f64x2_promote_low_f32x4((v128_t)half);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__vd_floats_simd128(const gsf__vd_simd128 halves[2]) {
+    const gsf__vf_simd128 low = (gsf__vf_simd128)wasm_f32x4_demote_f64x2_zero((v128_t)halves[0]);
+    const gsf__vf_simd128 high = (gsf__vf_simd128)wasm_f32x4_demote_f64x2_zero((v128_t)halves[1]);
+    return __builtin_shufflevector(low, high, 0, 1, 4, 5);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_madd_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b, gsf__vd_simd128 c) {
+    return a * b + c;
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_sqrt_simd128(gsf__vd_simd128 x) {
+    return (gsf__vd_simd128)wasm_f64x2_sqrt((v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_max_simd128(gsf__vd_simd128 a, gsf__vd_simd128 b) {
+    return (gsf__vd_simd128)wasm_f64x2_pmax((v128_t)b, (v128_t)a);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_keep_above_simd128(gsf__vd_simd128 a, gsf__vd_simd128 limit, gsf__vd_simd128 x) {
+    return (gsf__vd_simd128)wasm_v128_and(wasm_f64x2_gt((v128_t)a, (v128_t)limit), (v128_t)x);
+}
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_add_folded_simd128(gsf__vd_simd128 sum, gsf__vf_simd128 v) {
+    return sum + gsf__vd_half_simd128(v + __builtin_shufflevector(v, v, 2, 3, 2, 3), 0);
+}
+
+#endif
+
+GSF__INLINE_SIMD128 void gsf__v_transpose_simd128(gsf__vf_simd128* m) {
+    const gsf__vf_simd128 a = gsf__v_mix_low_simd128(m[0], m[2]), b = gsf__v_mix_low_simd128(m[1], m[3]);
+    const gsf__vf_simd128 c = gsf__v_mix_high_simd128(m[0], m[2]), d = gsf__v_mix_high_simd128(m[1], m[3]);
+    m[0] = gsf__v_mix_low_simd128(a, b);
+    m[1] = gsf__v_mix_high_simd128(a, b);
+    m[2] = gsf__v_mix_low_simd128(c, d);
+    m[3] = gsf__v_mix_high_simd128(c, d);
+}
+GSF__INLINE_SIMD128 void gsf__vi_store_pairs_simd128(int32_t* p, gsf__vi_simd128 a, gsf__vi_simd128 b) {
+    const gsf__vf_simd128 x = (gsf__vf_simd128)a, y = (gsf__vf_simd128)b;
+    gsf__vi_store_simd128(p, (gsf__vi_simd128)gsf__v_mix_low_simd128(x, y));
+    gsf__vi_store_simd128(p + 4, (gsf__vi_simd128)gsf__v_mix_high_simd128(x, y));
+}
+
+#endif // GSF__SIMD128
+
+// Powers, in terms of the vocabulary. The scalar versions, which have no FMA, go through double.
 
 #define gsf__v_exp2_terms GSF__V(gsf__v_exp2_terms)
 #define gsf__v_exp2_of GSF__V(gsf__v_exp2_of)
@@ -1734,8 +2535,8 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 #define gsf__v_exp2 GSF__V(gsf__v_exp2)
 #define gsf__v_exp GSF__V(gsf__v_exp)
 
-GSF__SHARED inline float gsf__v_exp2_scalar(float x) { return exp2f(x); }
-GSF__SHARED inline float gsf__v_exp_scalar(float x) { return expf(x); }
+GSF__SHARED inline float gsf__v_exp2_scalar(float x) { return gsf__exp2_f32(x); }
+GSF__SHARED inline float gsf__v_exp_scalar(float x) { return gsf__exp_f32(x); }
 
 GSF__END_IMPLEMENTATION
 
@@ -1781,22 +2582,57 @@ GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level) {
         case GSF_CPU_AVX512: return "avx512";
         case GSF_CPU_AVX512_VNNI: return "avx512_vnni";
         case GSF_CPU_AVX512_BF16: return "avx512_bf16";
+        case GSF_CPU_SIMD128: return "simd128";
     }
     return "unknown";
 }
 
+#if GSF__X86
+static void gsf__cpuid(unsigned leaf, unsigned subleaf, unsigned out[4]) { // eax, ebx, ecx, edx; 0 if there is no such leaf
+    memset(out, 0, 4 * sizeof *out);
+#if defined(_MSC_VER)
+    int registers[4];
+    __cpuid(registers, 0);
+    if ((unsigned)registers[0] < leaf) return;
+    __cpuidex(registers, (int)leaf, (int)subleaf);
+    for (int i = 0; i < 4; i++) out[i] = (unsigned)registers[i];
+#else
+    if (!__get_cpuid_count(leaf, subleaf, &out[0], &out[1], &out[2], &out[3])) memset(out, 0, 4 * sizeof *out);
+#endif
+}
+
+// Register state that the operating system saves (XCR0). Needs OSXSAVE.
+static uint64_t gsf__saved_state(void) {
+#if defined(_MSC_VER)
+    return _xgetbv(0);
+#else
+    uint32_t low, high;
+    __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+    return (uint64_t)high << 32 | low;
+#endif
+}
+#endif
+
+// By cpuid itself: __builtin_cpu_supports needs a run-time library that clang-cl does not link.
 static gsf_cpu_level gsf__detect_cpu_level(void) {
 #if GSF__X86
-    __builtin_cpu_init();
-    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !__builtin_cpu_supports("bmi"))
-        return GSF_CPU_SCALAR;
-    if (!__builtin_cpu_supports("avx512f") || !__builtin_cpu_supports("avx512bw") ||
-        !__builtin_cpu_supports("avx512dq") || !__builtin_cpu_supports("avx512vl"))
-        return GSF_CPU_AVX2;
-    if (!__builtin_cpu_supports("avx512vnni")) return GSF_CPU_AVX512;
-    return __builtin_cpu_supports("avx512bf16") ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
+    const unsigned fma = 1u << 12, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;             // leaf 1, ecx
+    const unsigned bmi = 1u << 3, avx2 = 1u << 5, f_dq = 1u << 16 | 1u << 17, bw_vl = 3u << 30;     // leaf 7, ebx
+    const unsigned vnni = 1u << 11, bf16 = 1u << 5;                                                 // ecx; leaf 7.1, eax
+    const uint64_t ymm = 6, zmm = 0xe6;                                                             // in XCR0
+    unsigned one[4], seven[4], more[4];
+    gsf__cpuid(1, 0, one);
+    gsf__cpuid(7, 0, seven);
+    gsf__cpuid(7, 1, more);
+    const unsigned first = fma | osxsave | avx | f16c;
+    if ((one[2] & first) != first || (seven[1] & (bmi | avx2)) != (bmi | avx2)) return GSF_CPU_SCALAR;
+    const uint64_t saved = gsf__saved_state();
+    if ((saved & ymm) != ymm) return GSF_CPU_SCALAR;
+    if ((saved & zmm) != zmm || (seven[1] & (f_dq | bw_vl)) != (f_dq | bw_vl)) return GSF_CPU_AVX2;
+    if (!(seven[2] & vnni)) return GSF_CPU_AVX512;
+    return more[0] & bf16 ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
 #else
-    return GSF_CPU_SCALAR;
+    return GSF__SIMD128 ? GSF_CPU_SIMD128 : GSF_CPU_SCALAR;
 #endif
 }
 
@@ -1805,7 +2641,7 @@ GSF_API void gsf_log(gsf_context* ctx, gsf_log_level level, const char* format, 
     char text[1024];
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     ctx->logger.log_fn(ctx->logger.user, level, text);
 }
@@ -1814,7 +2650,7 @@ GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* for
     char text[sizeof ctx->error]; // arguments may point into ctx->error
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     for (char* c = text; *c; c++)
         if ((unsigned char)*c < 0x20 || *c == 0x7f) *c = '?';
@@ -1917,6 +2753,7 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     }
     const gsf_cpu_level best = gsf__detect_cpu_level();
     if (ctx->cpu_level == GSF_CPU_AUTO || ctx->cpu_level > best) ctx->cpu_level = best;
+    if (best == GSF_CPU_SIMD128 && ctx->cpu_level != best) ctx->cpu_level = GSF_CPU_SCALAR; // levels of x86
     ctx->initialized = 1;
     return GSF_OK;
 }
@@ -1944,7 +2781,7 @@ GSF_API double gsf_draw_uniform(uint64_t seed, uint64_t stream, uint64_t index) 
 GSF_API double gsf_draw_normal(uint64_t seed, uint64_t stream, uint64_t index) { // Box-Muller
     const double u = 1.0 - gsf_draw_uniform(seed, stream, 2 * index);
     const double v = gsf_draw_uniform(seed, stream, 2 * index + 1);
-    return sqrt(-2.0 * log(u)) * cos(6.283185307179586 * v);
+    return sqrt(-2.0 * gsf__log_f64(u)) * gsf__cos_f64(6.283185307179586 * v);
 }
 
 // ---- >>text --------------------------------------------------------------------
@@ -1965,17 +2802,17 @@ GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* text, const char* for
     va_list args, again;
     va_start(args, format);
     va_copy(again, args);
-    char small[512];
-    const int length = vsnprintf(small, sizeof small, format, args);
+    char inside[512];
+    const int length = GSF__VSNPRINTF(inside, sizeof inside, format, args);
     va_end(args);
     if (length < 0) {
         text->failed = 1;
-    } else if ((size_t)length < sizeof small) {
-        gsf_append_bytes(ctx, text, small, (size_t)length);
+    } else if ((size_t)length < sizeof inside) {
+        gsf_append_bytes(ctx, text, inside, (size_t)length);
     } else if (!text->failed) {
         if (gsf__reserve(ctx, (void**)&text->data, &text->capacity, text->size, text->size + (size_t)length + 1, 1) ==
             GSF_OK) {
-            vsnprintf(text->data + text->size, (size_t)length + 1, format, again);
+            GSF__VSNPRINTF(text->data + text->size, (size_t)length + 1, format, again);
             text->size += (size_t)length;
         } else {
             text->failed = 1;
@@ -2035,30 +2872,13 @@ GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text) {
 
 // ---- >>files -------------------------------------------------------------------
 
-#if defined(__unix__) || defined(__APPLE__)
-#include <sys/stat.h>
-// Whether path is a device (/dev/stdout) or a pipe, which has to be written in place: a rename would replace it.
-static int gsf__is_device(const char* path) {
-    struct stat info;
-    return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
-}
-
-// Why an existing file must not be read, or NULL: opening a pipe blocks until it has a writer, and a device may never end.
-static const char* gsf__why_unreadable(const char* path) {
-    struct stat info;
-    if (stat(path, &info) != 0 || S_ISREG(info.st_mode)) return NULL;
-    return S_ISDIR(info.st_mode) ? "is a folder" : "is not a regular file";
-}
-#else
-static int gsf__is_device(const char* path) { (void)path; return 0; }
-static const char* gsf__why_unreadable(const char* path) { (void)path; return NULL; }
-#endif
-
-// Opens a file for reading; *out is NULL on failure.
+// Opens a file for reading; *out is NULL on failure. Opening a pipe would block until it has a writer, and a device may never
+// end.
 static gsf_result gsf__open_file(gsf_context* ctx, const char* path, FILE** out) {
-    const char* reason = gsf__why_unreadable(path);
+    const gsf__path_kind kind = gsf__look_at_path(ctx, path);
+    const char* reason = kind == GSF__PATH_FOLDER ? "is a folder" : kind == GSF__PATH_DEVICE ? "is not a regular file" : NULL;
     errno = 0;
-    *out = reason ? NULL : fopen(path, "rb");
+    *out = reason ? NULL : gsf__open_path(ctx, path, GSF__OPEN_READ);
     if (*out) return GSF_OK;
     return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, reason ? reason : strerror(errno));
 }
@@ -2083,11 +2903,11 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
             if (ferror(file)) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
             break;
         }
-        if (first && fseek(file, 0, SEEK_END) == 0) {
-            const long end = ftell(file);
-            if (end >= 0 && (unsigned long)end >= buffer.size)
+        if (first && gsf__seek(file, 0, SEEK_END) == 0) {
+            const int64_t end = gsf__tell(file);
+            if (end >= 0 && (uint64_t)end >= buffer.size && (uint64_t)end < SIZE_MAX / 2)
                 step = (size_t)end - buffer.size + 1;  // + 1, so that fread reaches the end of the file
-            if (fseek(file, (long)buffer.size, SEEK_SET) != 0) {
+            if (gsf__seek(file, (int64_t)buffer.size, SEEK_SET) != 0) {
                 result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
                 break;
             }
@@ -2111,7 +2931,7 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name)
         name->size = 0;
         gsf_append_text(ctx, name, i ? "%s.tmp%d" : "%s.tmp", path, i);
         errno = 0;
-        FILE* file = name->failed ? NULL : fopen(name->data, "wbx");
+        FILE* file = name->failed ? NULL : gsf__open_path(ctx, name->data, GSF__OPEN_NEW);
         if (file || name->failed || errno != EEXIST) return file;
     }
     return NULL;
@@ -2121,11 +2941,11 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name)
 // power failure can still lose data, because there is no fsync.
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
-    const int device = gsf__is_device(path);
+    const int device = gsf__look_at_path(ctx, path) == GSF__PATH_DEVICE; // as /dev/stdout: a rename would replace it
     gsf_buffer name;
     memset(&name, 0, sizeof name);
     gsf_result result = GSF_OK;
-    FILE* file = device ? fopen(path, "wb") : gsf__open_new(ctx, path, &name);
+    FILE* file = device ? gsf__open_path(ctx, path, GSF__OPEN_WRITE) : gsf__open_new(ctx, path, &name);
     if (name.failed) {
         result = GSF_ERROR_OUT_OF_MEMORY;
     } else if (!file) {
@@ -2138,16 +2958,12 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
             ok = 0;
             reason = errno;
         }
-        if (ok && !device && rename(name.data, path) != 0) {
-#ifdef _WIN32 // rename does not replace existing files there
-            ok = remove(path) == 0 && rename(name.data, path) == 0;
-#else
+        if (ok && !device && gsf__replace_path(ctx, name.data, path) != 0) {
             ok = 0;
-#endif
             reason = errno;
         }
         if (!ok) {
-            if (!device) remove(name.data);
+            if (!device) gsf__remove_path(ctx, name.data);
             result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(reason));
         }
     }
@@ -2767,11 +3583,11 @@ static void gsf__put_packed(gsf__deflater* d, int last, const uint8_t* bits) {
             gsf__put_bits(d, codes[low], bits[low]);
             continue;
         }
-        const gsf__lz_class l = gsf__length_class(length), far = gsf__distance_class(low);
+        const gsf__lz_class l = gsf__length_class(length), reach = gsf__distance_class(low);
         gsf__put_bits(d, codes[l.code], bits[l.code]);
         gsf__put_bits(d, l.extra, l.extra_bits);
-        gsf__put_bits(d, distance_codes[far.code], distance_bits[far.code]);
-        gsf__put_bits(d, far.extra, far.extra_bits);
+        gsf__put_bits(d, distance_codes[reach.code], distance_bits[reach.code]);
+        gsf__put_bits(d, reach.extra, reach.extra_bits);
     }
     gsf__put_bits(d, codes[GSF__BLOCK_END], bits[GSF__BLOCK_END]);
 }
@@ -2900,6 +3716,9 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
 #define STBI_ONLY_PNM
 #define STBI_NO_GIF
 #define STBI_NO_STDIO
+#ifdef __TINYC__ // no intrinsics
+#define STBI_NO_SIMD
+#endif
 #define STBI_ASSERT(x) ((void)0) // damaged files trigger some of them
 // Zeroed memory makes the pixels of damaged files deterministic: stb leaves parts unwritten, such as the tables of a scan or
 // the end of a row.
@@ -2956,7 +3775,7 @@ GSF_API gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtype, int64_t wid
     if (width < 1 || height < 1 || channels < 1 || gsf__dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
         (uint64_t)height > SIZE_MAX || !gsf__mul_size((size_t)width, (size_t)height, &count) ||
         !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf__dtype_size(dtype), &bytes) ||
-        bytes > INT64_MAX)
+        (uint64_t)bytes >> 63)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "image: %lld x %lld with %d channels of type %d",
                         (long long)width, (long long)height, (int)channels, (int)dtype);
     void* data = gsf_alloc_zeroed(ctx, bytes, 1);
@@ -3195,7 +4014,7 @@ static void gsf__stb_skip(void* user, int n) {
     gsf__stb_source* s = (gsf__stb_source*)user;
     if (n < 0) return;
     if (s->file) {
-        if (fseek(s->file, n, SEEK_CUR) != 0) s->overrun = 1;
+        if (gsf__seek(s->file, n, SEEK_CUR) != 0) s->overrun = 1;
     } else if ((size_t)n > s->size - s->at) {
         s->overrun = 1;
         n = (int)(s->size - s->at);
@@ -3784,7 +4603,7 @@ typedef struct gsf__resize_axis { // for each output position: taps first..first
 
 static double gsf__sinc(double x) {
     const double pi = 3.14159265358979323846;
-    return x == 0.0 ? 1.0 : sin(x * pi) / (x * pi);
+    return x == 0.0 ? 1.0 : gsf__sin_f64(x * pi) / (x * pi);
 }
 
 static double gsf__pil_filter(gsf_resize_filter filter, double x) {
@@ -5186,7 +6005,13 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
     const gsf__vf log2_e = gsf__v_set(1.44269504f), log2_e_low = gsf__v_set(1.92596299e-8f);
     x = gsf__v_min(gsf__v_set(89.4f), gsf__v_max(gsf__v_set(-87.4f), x)); // exponents of 2: -126.1 and 129
     const gsf__vf rounded = gsf__v_madd(x, log2_e, t.rounder), n = rounded - t.rounder;
-    return gsf__v_power(&t, rounded, gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n)));
+#if GSF__FUSED
+    const gsf__vf f = gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n));
+#else // the remainder of x first: the integer part of n times the first part of ln 2 is exact
+    const gsf__vf rest = (x - n * gsf__v_set(0.693359375f)) - n * gsf__v_set(-2.12194440e-4f);
+    const gsf__vf f = rest * log2_e + rest * log2_e_low;
+#endif
+    return gsf__v_power(&t, rounded, f);
 }
 
 #endif
@@ -5198,6 +6023,7 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
 #define GSF__KERNELS "gsfixer.h"
 #define GSF__KERNELS_POWERS
 #define GSF__KERNELS_AVX512
+#define GSF__KERNELS_SIMD128
 GSF__BEGIN_IMPLEMENTATION
 #include "gsfixer.h" // compiles the kernels above
 GSF__END_IMPLEMENTATION
@@ -5218,8 +6044,14 @@ GSF__END_IMPLEMENTATION
 #include GSF__KERNELS
 #undef GSF__ISA
 #endif
+#if GSF__SIMD128 && defined(GSF__KERNELS_SIMD128)
+#define GSF__ISA simd128
+#include GSF__KERNELS
+#undef GSF__ISA
+#endif
 #undef GSF__KERNELS
 #undef GSF__KERNELS_AVX512
+#undef GSF__KERNELS_SIMD128
 #endif
 #endif // GSF__ISA
 

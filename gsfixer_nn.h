@@ -910,9 +910,7 @@ typedef struct gsf__nn_files {
     size_t count, capacity, tensor_capacity;
 } gsf__nn_files;
 
-// ---- platform: the kind of a path, listing a folder, mapping a file
-
-typedef enum gsf__nn_path_kind { GSF__NN_UNKNOWN, GSF__NN_IS_FILE, GSF__NN_IS_FOLDER } gsf__nn_path_kind;
+// ---- platform: listing a folder, mapping a file
 
 // The name of the only file in `folder` that ends in `suffix`; empty if there is none. More than one is an error.
 typedef struct gsf__nn_listing {
@@ -925,33 +923,27 @@ static int gsf__nn_ends_in(const char* text, const char* suffix) {
     return size >= end && memcmp(text + size - end, suffix, end) == 0;
 }
 
+static gsf_result gsf__nn_list_name(gsf_context* ctx, gsf__nn_listing* listing, const char* name) {
+    if (name[0] == '.' || !gsf__nn_ends_in(name, listing->suffix)) return GSF_OK;
+    if (listing->found.size)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: contains both %s and %s: pass a prefix", listing->folder,
+                        listing->found.data, name);
+    gsf_append_bytes(ctx, &listing->found, name, strlen(name));
+    return listing->found.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
 #if defined(__unix__) || defined(__APPLE__)
 #include <dirent.h>
 #include <fcntl.h>
 #include <sys/mman.h>
-#include <sys/stat.h>
 #include <unistd.h>
-
-static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) {
-    struct stat info;
-    if (stat(path, &info) != 0) return GSF__NN_UNKNOWN;
-    return S_ISDIR(info.st_mode) ? GSF__NN_IS_FOLDER : GSF__NN_IS_FILE;
-}
 
 static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
     DIR* folder = opendir(listing->folder);
     if (!folder) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", listing->folder, strerror(errno));
     gsf_result result = GSF_OK;
-    for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
-        if (entry->d_name[0] == '.' || !gsf__nn_ends_in(entry->d_name, listing->suffix)) continue;
-        if (listing->found.size) {
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: contains both %s and %s: pass a prefix",
-                              listing->folder, listing->found.data, entry->d_name);
-        } else {
-            gsf_append_bytes(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
-            if (listing->found.failed) result = GSF_ERROR_OUT_OF_MEMORY;
-        }
-    }
+    for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;)
+        result = gsf__nn_list_name(ctx, listing, entry->d_name);
     closedir(folder);
     return result;
 }
@@ -976,9 +968,55 @@ static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned
 }
 
 static void gsf__nn_unmap(const unsigned char* data, size_t size) { munmap((void*)(uintptr_t)data, size); }
-#else
-static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) { (void)path; return GSF__NN_UNKNOWN; }
+#elif defined(_WIN32)
+static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
+    gsf_buffer pattern;
+    memset(&pattern, 0, sizeof pattern);
+    gsf_append_text(ctx, &pattern, "%s/*", listing->folder);
+    if (pattern.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__wide wide;
+    gsf__widen_path(ctx, pattern.data, &wide);
+    WIN32_FIND_DATAW entry;
+    HANDLE folder = wide.text ? FindFirstFileW(wide.text, &entry) : INVALID_HANDLE_VALUE;
+    if (wide.text && folder == INVALID_HANDLE_VALUE) gsf__set_errno(GetLastError());
+    const int reason = errno;
+    gsf__free_wide(ctx, &wide);
+    gsf_destroy_buffer(ctx, &pattern);
+    if (folder == INVALID_HANDLE_VALUE)
+        return gsf_fail(ctx, gsf__open_result(reason), "%s: %s", listing->folder, strerror(reason));
+    gsf_result result = GSF_OK;
+    do {
+        char name[3 * GSF__COUNT(entry.cFileName)]; // a unit of UTF-16 takes up to three bytes of UTF-8
+        if (WideCharToMultiByte(CP_UTF8, WC_ERR_INVALID_CHARS, entry.cFileName, -1, name, sizeof name, NULL, NULL) > 0)
+            result = gsf__nn_list_name(ctx, listing, name);
+    } while (result == GSF_OK && FindNextFileW(folder, &entry));
+    FindClose(folder);
+    return result;
+}
 
+// *data is NULL if the file cannot be mapped; it may still be readable.
+static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned char** data, size_t* size) {
+    *data = NULL;
+    *size = 0;
+    HANDLE file = gsf__open_handle(ctx, path, GENERIC_READ, OPEN_EXISTING, FILE_ATTRIBUTE_NORMAL);
+    if (file == INVALID_HANDLE_VALUE) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, strerror(errno));
+    LARGE_INTEGER bytes;
+    if (GetFileType(file) == FILE_TYPE_DISK && GetFileSizeEx(file, &bytes) && bytes.QuadPart > 0 &&
+        (uint64_t)bytes.QuadPart <= SIZE_MAX / 2) {
+        HANDLE mapping = CreateFileMappingW(file, NULL, PAGE_READONLY, 0, 0, NULL);
+        if (mapping) *data = (const unsigned char*)MapViewOfFile(mapping, FILE_MAP_READ, 0, 0, 0);
+        if (*data) *size = (size_t)bytes.QuadPart;
+        if (mapping) CloseHandle(mapping); // the view keeps it
+    }
+    CloseHandle(file);
+    return GSF_OK;
+}
+
+static void gsf__nn_unmap(const unsigned char* data, size_t size) {
+    (void)size;
+    UnmapViewOfFile(data);
+}
+#else
 static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
     (void)ctx;
     (void)listing;
@@ -1289,7 +1327,7 @@ static gsf_result gsf__pth_fail(const gsf__pth* p, gsf_result result, size_t at,
     char text[300];
     va_list args;
     va_start(args, format);
-    vsnprintf(text, sizeof text, format, args);
+    GSF__VSNPRINTF(text, sizeof text, format, args);
     va_end(args);
     return gsf_fail(p->ctx, result, "%s:%zu: %s", p->name, at, text);
 }
@@ -2351,7 +2389,7 @@ static gsf_result gsf__nn_open_prefix(gsf_context* ctx, const char* folder, cons
     char name[256];
     *found = 0;
     for (size_t i = 0; i < (may_lack ? 3 : 4) && !result && !*found; i++) {
-        if ((size_t)snprintf(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
+        if ((size_t)GSF__SNPRINTF(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a prefix of %zu bytes", folder, strlen(prefix));
         result = gsf__nn_open_named(ctx, folder, name, i < 3, found, weights);
     }
@@ -2364,7 +2402,7 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
     static const char* const usual[] = {"diffusion_pytorch_model", "model"};
     gsf_result result = GSF_OK;
     int found = 0;
-    if (!gsf__io_is_plain(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
+    if (!gsf__io_is_plain(ctx) || gsf__look_at_path(ctx, folder) == GSF__PATH_UNKNOWN) {
         for (size_t i = 0; i < GSF__COUNT(usual) && result == GSF_OK && !found; i++)
             result = gsf__nn_open_prefix(ctx, folder, usual[i], 1, &found, weights);
     }
@@ -2413,11 +2451,11 @@ static int gsf__nn_names_weights(const char* path) {
 GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, path, out);
     if (result != GSF_OK) return result;
-    const gsf__nn_path_kind kind = gsf__io_is_plain(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
+    const gsf__path_kind kind = gsf__io_is_plain(ctx) ? gsf__look_at_path(ctx, path) : GSF__PATH_UNKNOWN;
     int found;
-    if (kind != GSF__NN_IS_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
+    if (kind != GSF__PATH_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
         result = gsf__nn_open_index_file(ctx, path, out);
-    } else if (kind == GSF__NN_IS_FILE || (kind == GSF__NN_UNKNOWN && gsf__nn_names_weights(path))) {
+    } else if (kind != GSF__PATH_FOLDER && (kind != GSF__PATH_UNKNOWN || gsf__nn_names_weights(path))) {
         result = gsf__nn_add_file(ctx, path, out);
         if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
     } else if (prefix) {
@@ -2607,7 +2645,7 @@ GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_nn_tensor*
     char name[256];
     va_list args;
     va_start(args, format);
-    vsnprintf(name, sizeof name, format, args);
+    GSF__VSNPRINTF(name, sizeof name, format, args);
     va_end(args);
     return gsf__nn_take(loader, name, out, rank, shape);
 }
@@ -2756,7 +2794,7 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
     char wanted[80];
     *count = 0;
     if (!value || value->type != GSF_JSON_ARRAY || value->count < 1 || value->count > room) {
-        snprintf(wanted, sizeof wanted, "a list of 1 to %zu whole numbers", room);
+        GSF__SNPRINTF(wanted, sizeof wanted, "a list of 1 to %zu whole numbers", room);
         return gsf__nn_config_fail(config, value, key, wanted);
     }
     for (uint32_t i = value->child; i; i = config->json.values[i].next)
@@ -6251,7 +6289,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int32_t worker) {
     const int64_t n_end = gsf__least(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)block * gsf__conv_panel(layer);
     float* weights = panel + GSF__CONV_N;
-    float values[CHANNELS * GSF__CONV_TAPS];
+    float values[(int)CHANNELS * (int)GSF__CONV_TAPS];
     (void)worker;
     if (n_end < GSF__CONV_N || !layer->bias) memset(panel, 0, (size_t)gsf__conv_panel(layer) * sizeof(float));
     if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, panel);
@@ -6892,7 +6930,7 @@ static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t fi
     if (!run->tap || !data) return;
     const size_t size = (size_t)snprintf(name, sizeof name, "%s", run->label);
     va_start(args, format);
-    vsnprintf(name + size, sizeof name - size, format, args);
+    GSF__VSNPRINTF(name + size, sizeof name - size, format, args);
     va_end(args);
     for (int64_t i = 0; i < count; i++)
         run->tap->fn(run->tap->user, name, (int32_t)(first + i), data + i * rows * columns, rows, columns);
@@ -9792,22 +9830,22 @@ typedef struct gsf__caption_run {
 // Resizes the image as PIL does and normalizes it to floats (3, image_size, image_size).
 static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
     const int64_t side = net->image_size;
-    gsf_image coloured, small;
+    gsf_image coloured, little;
     memset(&coloured, 0, sizeof coloured);
-    memset(&small, 0, sizeof small);
+    memset(&little, 0, sizeof little);
     const int ready = image->dtype == GSF_U8 && image->channels == 3;
-    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &small);
+    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &little);
     if (!result && !ready) result = gsf_make_image(ctx, GSF_U8, image->width, image->height, 3, &coloured);
     if (!result && !ready) result = gsf_convert_image(ctx, image, &coloured);
-    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &small);
+    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &little);
     for (int64_t y = 0; y < side && !result; y++)
         for (int64_t x = 0; x < side; x++)
             for (int64_t c = 0; c < 3; c++) {
-                const uint8_t v = ((const uint8_t*)small.data)[(y * side + x) * 3 + c];
+                const uint8_t v = ((const uint8_t*)little.data)[(y * side + x) * 3 + c];
                 out[(c * side + y) * side + x] = ((float)((double)v * net->rescale) - net->mean[c]) / net->deviation[c];
             }
     gsf_destroy_image(ctx, &coloured);
-    gsf_destroy_image(ctx, &small);
+    gsf_destroy_image(ctx, &little);
     return result;
 }
 
@@ -15099,10 +15137,10 @@ static gsf_result gsf__mini_run_levels(gsf__mini_run* r) {
     for (int l = GSF__MINI_LEVELS - 2; l >= 0; l--) { // up; a 1x1 convolution may as well come before the upscaling
         const gsf__mini_level* net = &r->net->levels[l];
         const gsf__mini_planes *p = &r->levels[l], *below = p + 1;
-        float* small = p->a[GSF__MINI_BLOCKS]; // free until the block
+        float* little = p->a[GSF__MINI_BLOCKS]; // free until the block
         GSF__TRY(gsf__mini_convolve(r, &net->skip, p->x, r->batch, l, 0, 0, p->y));
-        GSF__TRY(gsf__mini_convolve(r, &net->below, below->y, r->batch, l + 1, 0, 0, small));
-        gsf__mini_scale_job job = {small, p->y, below->height, below->width, r->net->width[l]};
+        GSF__TRY(gsf__mini_convolve(r, &net->below, below->y, r->batch, l + 1, 0, 0, little));
+        gsf__mini_scale_job job = {little, p->y, below->height, below->width, r->net->width[l]};
         gsf__parallel_for(r->ctx, (size_t)(r->batch * p->height), gsf__mini_upscale_row, &job);
         GSF__TRY(gsf__mini_run_block(r, &net->out, l, GSF__MINI_BLOCKS, p->y));
         gsf__mini_relu(r, p->y, r->batch * p->height * p->width * r->net->width[l]);
@@ -17072,7 +17110,7 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
     const int64_t high = pair->pyramids[0][0].height, wide = pair->pyramids[0][0].width;
     const double down = (double)(1 << (3 - scale));
     const int64_t of_c = u->c1.weight->shape[0], of_f = u->f2.weight->shape[0], of_m = u->conv.weight->shape[0];
-    gsf__map corr, mix, flow1, input, hidden[2], small, delta;
+    gsf__map corr, mix, flow1, input, hidden[2], little, delta;
     const int room = net->room;
     GSF__TRY(gsf__amt_make(net, 1, high, wide, 2 * GSF__AMT_LOOKUP, &corr));
     GSF__TRY(gsf__amt_make(net, 1, high, wide, of_c + of_f, &mix));
@@ -17106,10 +17144,10 @@ static gsf_result gsf__amt_update_run(gsf__amt* net, int scale, const gsf__amt_p
         const char* const names[2] = {"update.out1", "update.out0"};
         GSF__TRY(gsf__amt_make(net, 1, high, wide, head[0].weight->shape[0], &hidden[0]));
         GSF__TRY(gsf__amt_convolve_to(net, &head[0], 0.1f, &hidden[1], &hidden[0]));
-        GSF__TRY(gsf__amt_make(net, 1, high, wide, to->channels, &small));
-        GSF__TRY(gsf__amt_convolve_to(net, &head[1], 1.0f, &hidden[0], &small));
+        GSF__TRY(gsf__amt_make(net, 1, high, wide, to->channels, &little));
+        GSF__TRY(gsf__amt_convolve_to(net, &head[1], 1.0f, &hidden[0], &little));
         GSF__TRY(gsf__amt_make(net, 1, to->height, to->width, to->channels, &delta));
-        gsf__amt_resize(net, &small, down, i ? 1.0 : down, &delta);
+        gsf__amt_resize(net, &little, down, i ? 1.0 : down, &delta);
         gsf__amt_reveal(net, names[i], scale, &delta);
         gsf__amt_add(net, &delta, to);
     }
@@ -18644,8 +18682,8 @@ static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, fl
     b->dv = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->k_across = gsf__nn_share(&arena, across);
     b->v_across = gsf__nn_share(&arena, across);
-    b->p = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
-    b->dp = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->p = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->dp = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->center = gsf__nn_share(&arena, pitch);
     b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
     return arena.used;

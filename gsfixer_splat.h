@@ -772,7 +772,6 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 #include "gsfixer.h" // adds internals and implementation if it was first included without the implementation macro
 #include "gsfixer_traj.h"
 
-#include <time.h>
 
 #ifdef GSF_USE_ZSTD
 #include <zstd.h>
@@ -1475,7 +1474,7 @@ static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* ba
 static void gsf__make_logits(float logits[256]) {
     for (int i = 0; i < 256; i++) {
         const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
-        logits[i] = (float)log(p / (1.0 - p));
+        logits[i] = (float)gsf__log_f64(p / (1.0 - p));
     }
 }
 
@@ -1661,7 +1660,7 @@ static unsigned char gsf__to_u8(float value) {
     return value >= 255.0f ? (unsigned char)255 : value > 0.0f ? (unsigned char)(value + 0.5f) : (unsigned char)0;
 }
 
-static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + expf(-logit)); }
+static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + gsf__exp_f32(-logit)); }
 
 // Normalises a quaternion. Zero becomes the identity, as in the rasterizer.
 static void gsf__unit_quat(const float* q, float out[4]) {
@@ -1749,7 +1748,7 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
         if (row % stride == 0) samples[n++] = (double)gsf__mean_log_scale(splats, i);
     }
     qsort(samples, n, sizeof samples[0], gsf__compare_doubles);
-    job->typical = n ? exp(samples[n / 2]) : 1.0;
+    job->typical = n ? gsf__exp_f64(samples[n / 2]) : 1.0;
     return GSF_OK;
 }
 
@@ -1792,7 +1791,7 @@ static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t k = 0; k < 3; k++) {
             const float scale = gsf__get_f32(row + 12 + 4 * k);
             bad |= gsf__float_is_bad(scale) | (scale < 0.0f);
-            s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
+            s->log_scales[3 * i + k] = gsf__log_f32(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
             s->sh[3 * i + k] = ((float)row[24 + k] / 255.0f - 0.5f) / gsf__dc_scale;
         }
         s->opacity_logits[i] = job->logits[row[27]];
@@ -1821,7 +1820,7 @@ static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         unsigned char* p = job->out + GSF__SPLAT_ROW * row;
         float q[4];
         for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, (float)(s->origin[k] + (double)s->means[3 * i + k]));
-        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, fminf(expf(s->log_scales[3 * i + k]), FLT_MAX));
+        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, fminf(gsf__exp_f32(s->log_scales[3 * i + k]), FLT_MAX));
         for (size_t k = 0; k < 3; k++) *p++ = gsf__to_u8((0.5f + gsf__dc_scale * s->sh[sh * i + k]) * 255.0f);
         *p++ = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
         gsf__unit_quat(s->quats + 4 * i, q);
@@ -2597,12 +2596,12 @@ static void gsf__glb_decode_row(const gsf__glb* glb, const gsf__glb_part* part, 
     s->opacity_logits[i] = glb->logits       ? opacity
                            : opacity <= 0.0f ? job->logits[0]
                            : opacity >= 1.0f ? job->logits[255]
-                                             : logf(opacity / (1.0f - opacity));
+                                             : gsf__log_f32(opacity / (1.0f - opacity));
     bad |= gsf__float_is_bad(opacity);
     for (size_t k = 0; k < 3; k++) {
         const float scale = gsf__glb_value(columns + GSF__GLB_SCALE, row, k);
-        const float value = glb->log_scales ? scale : logf(fmaxf(scale, FLT_MIN));
-        s->log_scales[3 * i + k] = value + (part->scale == 1.0 ? 0.0f : logf((float)part->scale));
+        const float value = glb->log_scales ? scale : gsf__log_f32(fmaxf(scale, FLT_MIN));
+        s->log_scales[3 * i + k] = value + (part->scale == 1.0 ? 0.0f : gsf__log_f32((float)part->scale));
         bad |= gsf__float_is_bad(scale);
     }
     float q[4];  // x y z w of the file
@@ -2705,14 +2704,14 @@ static void gsf__glb_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     gsf__sh_signs(gsf__glb_axes, signs);
     for (size_t row = begin; row < gsf__codec_end(n, begin); row++) {
         const size_t i = job->rows[row];
-        const float opacity = 1.0f / (1.0f + expf(-s->opacity_logits[i]));
+        const float opacity = 1.0f / (1.0f + gsf__exp_f32(-s->opacity_logits[i]));
         float q[4];
         double rgba[4];
         gsf__unit_quat(s->quats + 4 * i, q);
         for (size_t k = 0; k < 3; k++) {
             gsf__put_f32(positions + 12 * row + 4 * k, gsf__glb_axes[k] * s->means[3 * i + k]);
             gsf__put_f32(rotations + 16 * row + 4 * k, gsf__glb_axes[k] * q[1 + k]);
-            gsf__put_f32(scales + 12 * row + 4 * k, fminf(expf(s->log_scales[3 * i + k]), FLT_MAX));
+            gsf__put_f32(scales + 12 * row + 4 * k, fminf(gsf__exp_f32(s->log_scales[3 * i + k]), FLT_MAX));
             rgba[k] = fmin(fmax(0.5 + (double)(gsf__dc_scale * s->sh[3 * bands * i + k]), 0.0), 1.0);
         }
         gsf__put_f32(rotations + 16 * row + 12, q[0]);
@@ -3826,7 +3825,7 @@ static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
     r->lens = *lens;
     if (lens->kind == GSF__LENS_FOV) {
         const double omega = fabs(lens->k[0]);
-        r->lens.k[1] = omega < 1e-6 ? 1.0 : 2.0 * tan(0.5 * omega);
+        r->lens.k[1] = omega < 1e-6 ? 1.0 : 2.0 * gsf__tan_f64(0.5 * omega);
         r->lens.k[2] = omega < 1e-6 ? 1.0 : r->lens.k[1] / omega;
         if (omega < 1e-6) r->lens.kind = GSF__LENS_PINHOLE;
     }
@@ -4053,8 +4052,8 @@ static int gsf__camera_lens(const gsf__sfm_camera* camera, int64_t width, int64_
         out->width = (int32_t)width;
         out->height = (int32_t)height;
     }
-    if (!(out->fx > 0.0)) out->fx = 0.5 * out->width / tan(0.5 * camera->angle_x);
-    if (!(out->fy > 0.0)) out->fy = camera->angle_y > 0.0 ? 0.5 * out->height / tan(0.5 * camera->angle_y) : out->fx;
+    if (!(out->fx > 0.0)) out->fx = 0.5 * out->width / gsf__tan_f64(0.5 * camera->angle_x);
+    if (!(out->fy > 0.0)) out->fy = camera->angle_y > 0.0 ? 0.5 * out->height / gsf__tan_f64(0.5 * camera->angle_y) : out->fx;
     if (isnan(out->cx)) out->cx = 0.5 * out->width;
     if (isnan(out->cy)) out->cy = 0.5 * out->height;
     return isfinite(out->fx) && isfinite(out->fy) && out->fx > 0.0 && out->fy > 0.0;
@@ -4978,7 +4977,7 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
         double mean = 0.0;
         for (int k = 0; k < found; k++) mean += distance2[k];
         if (found) mean /= found;
-        job->log_scales[i] = (float)(0.5 * log(mean > 1e-7 ? mean : 1e-7));
+        job->log_scales[i] = (float)(0.5 * gsf__log_f64(mean > 1e-7 ? mean : 1e-7));
     }
 }
 
@@ -5043,11 +5042,6 @@ typedef struct gsf__discs { // the points as oriented discs, in tree order (neig
     int near_count;
     uint8_t* oriented; // (count) 1: the normal points towards the views in the neighbours' tracks
 } gsf__discs;
-
-static double gsf__vis_seconds(void) { // for the statistics only
-    struct timespec t;
-    return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
-}
 
 #define GSF__VIS_ANY_DISC 1e-30f // less than any disc adds, yet positive: a cover of 0 reaches a limit of 0
 
@@ -5411,8 +5405,8 @@ static void gsf__vis_likelihoods(gsf__vis_job* job) {
         }
         double p = (finds + 1.0) / (tries + 20.0);
         p = p < 0.02 ? 0.02 : p > 0.95 ? 0.95 : p;
-        job->found[b] = log(p / wrong);
-        job->missed[b] = log((1.0 - p) / (1.0 - wrong));
+        job->found[b] = gsf__log_f64(p / wrong);
+        job->missed[b] = gsf__log_f64((1.0 - p) / (1.0 - wrong));
     }
 }
 
@@ -5659,9 +5653,9 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
         for (int k = 0; k < 3; k++) job->centers[3 * i + (size_t)k] -= origin[k];
     }
 
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     GSF__TRY(gsf__discs_make(&job->arena, scene, origin, desc, &job->discs));
-    stats->seconds_normals = gsf__vis_seconds() - start;
+    stats->seconds_normals = gsf__seconds() - start;
     const size_t n = job->discs.count, chunks = (n + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
     job->seen = (uint8_t*)gsf__arena_alloc(&job->arena, n, 1);
     job->counts = (gsf__vis_counts*)gsf__arena_alloc_zeroed(&job->arena, chunks, sizeof *job->counts);
@@ -5684,14 +5678,14 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
 static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                    const gsf_visibility_desc* desc, uint8_t* keep, gsf_visibility_stats* stats) {
     gsf__vis_job job;
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     gsf_result result = gsf__vis_begin(ctx, scene, views, view_count, desc, keep, &job, stats);
 #ifdef GSF_USE_EMBREE
     if (result == GSF_OK && !desc->use_zbuffer) result = gsf__vis_by_embree(ctx, &job, stats);
 #endif
     if (result == GSF_OK && !stats->used_embree) result = gsf__vis_by_cells(ctx, &job);
     if (result == GSF_OK) {
-        stats->seconds_rays = gsf__vis_seconds() - start - stats->seconds_normals - stats->seconds_build;
+        stats->seconds_rays = gsf__seconds() - start - stats->seconds_normals - stats->seconds_build;
         for (size_t i = 0; i * GSF__VIS_CHUNK < job.discs.count; i++) {
             stats->rays += job.counts[i].rays;
             stats->culled += job.counts[i].culled;
@@ -5764,6 +5758,7 @@ enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_HIDE
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_HIDE
 #endif // GSF_USE_EMBREE
@@ -6016,7 +6011,7 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
-    job->hide8 = GSF__KERNEL_OF(ctx->cpu_level, gsf__hide8);
+    job->hide8 = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__hide8);
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
@@ -6027,7 +6022,7 @@ static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
 
 // If Embree fails, logs a warning and leaves stats->used_embree 0.
 static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_visibility_stats* stats) {
-    const double start = gsf__vis_seconds();
+    const double start = gsf__seconds();
     int refused = 0;
     gsf_result result = GSF_OK;
     RTCScene scene = NULL;
@@ -6044,7 +6039,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
     }
     if (device && error == RTC_ERROR_NONE) {
         stats->used_embree = 1;
-        stats->seconds_build = gsf__vis_seconds() - start;
+        stats->seconds_build = gsf__seconds() - start;
         job->embree_scene = scene;
         result = gsf__embree_run(ctx, job);
     } else
@@ -6266,6 +6261,7 @@ static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sum
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_STEREO
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_STEREO
 
@@ -6339,10 +6335,10 @@ static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* w
             window->dx[window->count] = (float)dx;
             window->dy[window->count] = (float)dy;
             window->spatial[window->count++] =
-                (float)exp(-(double)(dx * dx + dy * dy) / (2.0 * (double)d->radius * (double)d->radius));
+                (float)gsf__exp_f64(-(double)(dx * dx + dy * dy) / (2.0 * (double)d->radius * (double)d->radius));
         }
     window->count = (window->count + 7) / 8 * 8;
-    for (int i = 0; i < 256; i++) window->tonal[i] = (float)exp(-(double)i / (double)d->color_sigma);
+    for (int i = 0; i < 256; i++) window->tonal[i] = (float)gsf__exp_f64(-(double)i / (double)d->color_sigma);
 }
 
 // Returns 0 if the window has too little texture to match.
@@ -6771,7 +6767,7 @@ static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, co
     gsf_get_camera_center(a, ca);
     gsf_get_camera_center(b, cb);
     const double c = gsf__ray_cosine(point, ca, cb);
-    const double degrees = acos(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
+    const double degrees = gsf__acos_f64(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
     if (!(degrees >= (double)job->desc.min_angle)) return 0.0;
     const double off = (degrees - 10.0) / (degrees < 10.0 ? 4.0 : 20.0), scale = a->fx / depth_a / (b->fx / depth_b);
     return (scale < 1.0 ? scale : 1.0 / scale) / (1.0 + off * off);
@@ -7258,7 +7254,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf__arena* arena, gsf_de
     size_t starts[BINS + 1], count = 0, n = 0;
     job->links = (uint8_t*)gsf__arena_alloc(&job->level_arena, job->pixel_count, 1);
     if (!job->links) return GSF_ERROR_OUT_OF_MEMORY;
-    job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
+    job->min_normal_dot = (float)gsf__cos_f64((double)job->desc.max_normal_angle * 0.017453292519943295);
     gsf__dense_hide(job);
     gsf__dense_run(job, gsf__dense_link);
     memset(starts, 0, sizeof starts);
@@ -7347,12 +7343,12 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     job->scene = scene;
     job->desc = d;
     job->keep = keep;
-    job->cost_fn = GSF__KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
+    job->cost_fn = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
     gsf__dense_make_window(&d, &job->window);
-    double start = gsf__vis_seconds();
+    double start = gsf__seconds();
     gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
     counted.views = job->view_count;
-    counted.seconds_prepare = gsf__vis_seconds() - start;
+    counted.seconds_prepare = gsf__seconds() - start;
     start += counted.seconds_prepare;
     int32_t levels = 1;
     for (; levels < d.levels; levels++) {
@@ -7365,12 +7361,12 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
         if (!fits) break;
     }
     if (result == GSF_OK && counted.pairs) result = gsf__dense_match(job, levels);
-    counted.seconds_match = gsf__vis_seconds() - start;
+    counted.seconds_match = gsf__seconds() - start;
     start += counted.seconds_match;
     gsf__arena arena = {ctx, NULL, 0};
     if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, &arena, out, &counted);
     out->owned = arena.last;
-    counted.seconds_fuse = gsf__vis_seconds() - start;
+    counted.seconds_fuse = gsf__seconds() - start;
     if (result == GSF_OK && !counted.pairs)
         gsf_log(ctx, GSF_LOG_WARNING, "dense points: none, because no two of the %zu views overlap", job->view_count);
     gsf__dense_free_level(job);
@@ -7644,6 +7640,7 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_PROJECT
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_PROJECT
@@ -8046,6 +8043,7 @@ enum { GSF__SPANS = 8 }; // tile rows processed at a time; a multiple of the num
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_BIN
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_BIN
 
@@ -8096,7 +8094,7 @@ typedef struct gsf__bin_job {
 
 static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int32_t ty, int32_t left,
                             gsf__tile_span spans[GSF__SPANS]) {
-    GSF__KERNEL_OF(gsf__footprint_level(job->view, job->level), gsf__tile_columns)(job->r, rec, ty, left, spans);
+    GSF__LANE_KERNEL_OF(gsf__footprint_level(job->view, job->level), gsf__tile_columns)(job->r, rec, ty, left, spans);
     if (!job->view->official_footprint) return;
     const gsf__tile_rect rect = gsf__official_rect(rec, job->r->tiles_x, job->r->tiles_y);
     for (int32_t i = 0; i < left && i < GSF__SPANS; i++) {
@@ -8354,7 +8352,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     }
 }
 
-#if GSF__X86
+#if GSF__X86 || GSF__SIMD128
 
 // Columns of the pixels of strip k, from 16 k on, and rows of those of a pair of rows j, from 8 j on: for one or two steps.
 GSF__LINES static const float gsf__columns_of[64] = {0,  0,  1,  1,  2,  2,  3,  3,  0,  0,  1,  1,  2,  2,  3,  3,
@@ -8365,6 +8363,10 @@ GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,
                                                   4,  5,  4,  5,  4,  5,  4,  5,  6,  7,  6,  7,  6,  7,  6,  7,
                                                   8,  9,  8,  9,  8,  9,  8,  9,  10, 11, 10, 11, 10, 11, 10, 11,
                                                   12, 13, 12, 13, 12, 13, 12, 13, 14, 15, 14, 15, 14, 15, 14, 15};
+
+#endif
+
+#if GSF__X86
 
 // The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
 // compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
@@ -8605,6 +8607,164 @@ GSF__TARGET_AVX512 static void gsf__blend_avx512(const gsf__tile* tile, gsf__til
 }
 
 #endif // GSF__X86
+
+#if GSF__SIMD128
+
+// A step is two vectors: two columns each, in which the two rows alternate.
+typedef struct gsf__pair_simd128 { gsf__vf_simd128 low, high; } gsf__pair_simd128;
+
+#if GSF__NEON
+GSF__INLINE_SIMD128 uint32_t gsf__bits8_simd128(gsf__vm_simd128 low, gsf__vm_simd128 high) { // a bit per lane of both
+    const uint16x8_t bit = {1, 2, 4, 8, 16, 32, 64, 128};
+    return vaddvq_u16(vandq_u16(vuzp1q_u16(vreinterpretq_u16_s32(low), vreinterpretq_u16_s32(high)), bit));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__twice_simd128(const float* p) { // p[0] p[1] p[0] p[1]
+    const float32x2_t pair = vld1_f32(p);
+    return vcombine_f32(pair, pair);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__even_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vuzp1q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__odd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vuzp2q_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__least_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vminq_f32(a, b); }
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__most_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { return vmaxq_f32(a, b); }
+GSF__INLINE_SIMD128 int gsf__all_negative_simd128(gsf__vi_simd128 x) { return vmaxvq_s32(x) < 0; }
+GSF__INLINE_SIMD128 int gsf__any_positive_simd128(gsf__vf_simd128 x) { return vmaxvq_f32(x) > 0.0f; }
+#else
+GSF__INLINE_SIMD128 uint32_t gsf__bits8_simd128(gsf__vm_simd128 low, gsf__vm_simd128 high) {
+    return (uint32_t)wasm_i16x8_bitmask(wasm_i16x8_narrow_i32x4((v128_t)low, (v128_t)high));
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__twice_simd128(const float* p) {
+    return (gsf__vf_simd128)wasm_v128_load64_splat(p);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__even_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 0, 2, 4, 6);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__odd_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return __builtin_shufflevector(a, b, 1, 3, 5, 7);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__least_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return gsf__v_min_simd128(a, b);
+}
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__most_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) {
+    return gsf__v_max_simd128(a, b);
+}
+GSF__INLINE_SIMD128 int gsf__all_negative_simd128(gsf__vi_simd128 x) { return wasm_i32x4_bitmask((v128_t)x) == 15; }
+GSF__INLINE_SIMD128 int gsf__any_positive_simd128(gsf__vf_simd128 x) {
+    return wasm_v128_any_true(wasm_f32x4_gt((v128_t)x, wasm_f32x4_const(0, 0, 0, 0)));
+}
+#endif
+
+// Like gsf__rows_scalar, 4 rows at a time. Values are finite, so that least and most need not care for a NaN.
+GSF__INLINE_SIMD128 uint32_t gsf__rows_simd128(const gsf__record* rec, float u, float v, float center[GSF__TILE],
+                                               float exponent[GSF__TILE]) {
+    const gsf__vf_simd128 kx = gsf__v_set_simd128(rec->kx), yy = gsf__v_set_simd128(rec->yy), zero = gsf__v_set_simd128(0.0f);
+    const gsf__vf_simd128 h0 = gsf__v_set_simd128(rec->h0), h1 = gsf__v_set_simd128(rec->h1);
+    const gsf__vf_simd128 lo = gsf__v_set_simd128(rec->log2_opacity), center_u = gsf__v_set_simd128(u);
+    const gsf__vf_simd128 rows = {0, 1, 2, 3}, margin = gsf__v_set_simd128(0.02f), none = gsf__v_set_simd128(-1e30f);
+    gsf__vf_simd128 left[GSF__TILE / 4], right[GSF__TILE / 4], from[2], to[2];
+    for (int k = 0; k < GSF__TILE / 4; k++) {
+        const gsf__vf_simd128 dy = rows + gsf__v_set_simd128((float)(4 * k) - v);
+        const gsf__vf_simd128 half2 = gsf__v_nmadd_simd128(h1 * dy, dy, h0), c = gsf__v_madd_simd128(kx, dy, center_u);
+        gsf__v_store_simd128(center + 4 * k, c);
+        gsf__v_store_simd128(exponent + 4 * k, gsf__v_madd_simd128(yy * dy, dy, lo));
+        const gsf__vf_simd128 wide = gsf__v_sqrt_simd128(gsf__most_simd128(half2, zero)) + margin;
+        const gsf__vf_simd128 half = gsf__v_select_simd128(gsf__v_ge_simd128(half2, zero), wide, none);
+        left[k] = c - half;
+        right[k] = c + half;
+    }
+    for (int k = 0; k < 2; k++) { // of two rows, the union, which has no gap because the ellipse is convex
+        from[k] = gsf__least_simd128(gsf__even_simd128(left[2 * k], left[2 * k + 1]),
+                                     gsf__odd_simd128(left[2 * k], left[2 * k + 1]));
+        to[k] = gsf__most_simd128(gsf__even_simd128(right[2 * k], right[2 * k + 1]),
+                                  gsf__odd_simd128(right[2 * k], right[2 * k + 1]));
+    }
+    uint32_t mask = 0;
+    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+        const gsf__vf_simd128 first = gsf__v_set_simd128((float)(GSF__STRIP * strip));
+        const gsf__vf_simd128 last = gsf__v_set_simd128((float)(GSF__STRIP * strip + GSF__STRIP - 1));
+        mask |= gsf__bits8_simd128(gsf__v_le_simd128(from[0], last) & gsf__v_ge_simd128(to[0], first),
+                                   gsf__v_le_simd128(from[1], last) & gsf__v_ge_simd128(to[1], first)) << (8 * strip);
+    }
+    return mask;
+}
+
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__exp2_simd128(gsf__vf_simd128 x) { // as gsf__exp2_avx2
+    const gsf__vf_simd128 k = gsf__v_round_simd128(x), f = x - k;
+    gsf__vf_simd128 p = gsf__v_set_simd128(1.3276404e-3f);
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(9.6755413e-3f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(5.5507135e-2f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(0.24022120f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(0.69314694f));
+    p = gsf__v_madd_simd128(p, f, gsf__v_set_simd128(1.0000001f));
+    const gsf__vi_simd128 shift = gsf__vi_shl_simd128(gsf__v_to_int_simd128(k), 23);
+    return gsf__vi_as_floats_simd128(gsf__vi_add_simd128(gsf__v_bits_simd128(p), shift));
+}
+
+// Alphas, before the clamp, of a step whose rows have their centre and exponent in `center` and `exponent`; 0 below 1/255.
+GSF__INLINE_SIMD128 gsf__pair_simd128 gsf__alphas_simd128(float ee, const float* center, const float* exponent, uint32_t s) {
+    const gsf__vf_simd128 c = gsf__twice_simd128(center), x0 = gsf__twice_simd128(exponent);
+    const gsf__vf_simd128 limit = gsf__v_set_simd128(GSF__LOG2_ALPHA_MIN), scale = gsf__v_set_simd128(ee);
+    const gsf__vf_simd128 e0 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3)) - c;
+    const gsf__vf_simd128 e1 = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3) + 4) - c;
+    const gsf__vf_simd128 low = gsf__v_madd_simd128(scale * e0, e0, x0), high = gsf__v_madd_simd128(scale * e1, e1, x0);
+    const gsf__pair_simd128 raw = {gsf__v_keep_simd128(gsf__v_ge_simd128(low, limit), gsf__exp2_simd128(low)),
+                                   gsf__v_keep_simd128(gsf__v_ge_simd128(high, limit), gsf__exp2_simd128(high))};
+    return raw;
+}
+
+// As gsf__next_avx2.
+GSF__INLINE_SIMD128 gsf__vf_simd128 gsf__next_simd128(gsf__vf_simd128 T, gsf__vf_simd128 raw, gsf__vf_simd128* weight,
+                                                      gsf__vm_simd128* shown) {
+    const gsf__vf_simd128 alpha = gsf__least_simd128(raw, gsf__v_set_simd128(GSF__ALPHA_MAX));
+    const gsf__vf_simd128 open = gsf__most_simd128(T, gsf__v_set_simd128(0.0f)), next = gsf__v_nmadd_simd128(open, alpha, T);
+    *shown = gsf__v_ge_simd128(next, gsf__v_set_simd128(GSF__T_MIN));
+    *weight = gsf__v_keep_simd128(*shown, open * alpha);
+    const gsf__vf_simd128 finished = (gsf__vf_simd128)((gsf__vi_simd128)T | gsf__vi_set_simd128(-0x7fffffff - 1));
+    return gsf__v_select_simd128(*shown, next, finished);
+}
+
+GSF__INLINE_SIMD128 int gsf__is_open_simd128(gsf__vf_simd128 a, gsf__vf_simd128 b) { // any of the pixels
+    return !gsf__all_negative_simd128((gsf__vi_simd128)a & (gsf__vi_simd128)b);
+}
+
+GSF__INLINE_SIMD128 uint32_t gsf__live_simd128(const float* T) {
+    uint32_t live = 0;
+    for (uint32_t s = 0; s < GSF__STEPS; s++)
+        live |= (uint32_t)gsf__is_open_simd128(gsf__v_load_simd128(T + 8 * s), gsf__v_load_simd128(T + 8 * s + 4)) << s;
+    return live;
+}
+
+GSF__INLINE_SIMD128 void gsf__add_simd128(float* sum, gsf__vf_simd128 w0, gsf__vf_simd128 w1, float factor) {
+    const gsf__vf_simd128 f = gsf__v_set_simd128(factor);
+    gsf__v_store_simd128(sum, gsf__v_madd_simd128(w0, f, gsf__v_load_simd128(sum)));
+    gsf__v_store_simd128(sum + 4, gsf__v_madd_simd128(w1, f, gsf__v_load_simd128(sum + 4)));
+}
+
+static void gsf__blend_simd128(const gsf__tile* tile, gsf__tile_state* state, int flags) {
+    uint32_t live = gsf__live_simd128(state->T);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    for (size_t i = 0; i < tile->count && live; i++) {
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
+        for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
+            const size_t at = 8 * s;
+            const gsf__pair_simd128 raw = gsf__alphas_simd128(rec->ee, center + row, exponent + row, s);
+            gsf__vf_simd128 w0, w1;
+            gsf__vm_simd128 shown;
+            const gsf__vf_simd128 T0 = gsf__next_simd128(gsf__v_load_simd128(state->T + at), raw.low, &w0, &shown);
+            const gsf__vf_simd128 T1 = gsf__next_simd128(gsf__v_load_simd128(state->T + at + 4), raw.high, &w1, &shown);
+            gsf__v_store_simd128(state->T + at, T0);
+            gsf__v_store_simd128(state->T + at + 4, T1);
+            gsf__add_simd128(state->r + at, w0, w1, rec->r);
+            gsf__add_simd128(state->g + at, w0, w1, rec->g);
+            gsf__add_simd128(state->b + at, w0, w1, rec->b);
+            if (flags & GSF__WITH_DEPTH) gsf__add_simd128(state->z + at, w0, w1, rec->depth);
+            if (!gsf__is_open_simd128(T0, T1)) live &= ~(1u << s);
+        }
+    }
+}
+
+#endif // GSF__SIMD128
 
 // ---- >>raster backward ---------------------------------------------------------
 
@@ -8917,6 +9077,120 @@ GSF__TARGET_AVX512 static void gsf__reverse_avx512(const gsf__tile* tile, const 
 
 #endif // GSF__X86
 
+#if GSF__SIMD128
+
+static size_t gsf__keep_simd128(const gsf__tile* tile, float* T_tile, size_t first, size_t last, gsf__step* steps,
+                                gsf__step_head* heads, size_t* step_count) {
+    uint32_t live = gsf__live_simd128(T_tile);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    size_t kept = 0, i = first;
+    for (; i < last && live && kept <= GSF__BUCKET; i++) {
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
+        for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
+            float* T = T_tile + 8 * s;
+            const gsf__pair_simd128 raw = gsf__alphas_simd128(rec->ee, center + row, exponent + row, s);
+            gsf__vf_simd128 weight;
+            gsf__vm_simd128 shown0, shown1;
+            const gsf__vf_simd128 old0 = gsf__v_load_simd128(T), old1 = gsf__v_load_simd128(T + 4);
+            const gsf__vf_simd128 T0 = gsf__next_simd128(old0, raw.low, &weight, &shown0);
+            const gsf__vf_simd128 T1 = gsf__next_simd128(old1, raw.high, &weight, &shown1);
+            gsf__v_store_simd128(T, T0);
+            gsf__v_store_simd128(T + 4, T1);
+            const gsf__vf_simd128 alpha0 = gsf__v_keep_simd128(shown0, raw.low), alpha1 = gsf__v_keep_simd128(shown1, raw.high);
+            gsf__v_store_simd128(steps[kept].alpha, alpha0);
+            gsf__v_store_simd128(steps[kept].alpha + 4, alpha1);
+            gsf__v_store_simd128(steps[kept].T, old0);
+            gsf__v_store_simd128(steps[kept].T + 4, old1);
+            heads[kept].entry = (uint32_t)i;
+            heads[kept].step = s;
+            kept += (size_t)gsf__any_positive_simd128(alpha0 + alpha1);
+            if (!gsf__is_open_simd128(T0, T1)) live &= ~(1u << s);
+        }
+    }
+    *step_count = kept;
+    return live && i < last ? i : tile->count;
+}
+
+GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                                   size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                                   uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
+    const gsf__vf_simd128 alpha_max = gsf__v_set_simd128(GSF__ALPHA_MAX), zero = gsf__v_set_simd128(0.0f);
+    for (size_t k = step_count; k > 0;) {
+        const uint32_t entry = heads[k - 1].entry;
+        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__vf_simd128 u = gsf__v_set_simd128(rec->u - tile->x0 + rec->u_low);
+        const gsf__vf_simd128 v = gsf__v_set_simd128(rec->v - tile->y0 + rec->v_low), kx = gsf__v_set_simd128(rec->kx);
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        gsf__vf_simd128 sum[GSF__SLOT_FLOATS];
+        for (int i = 0; i < GSF__SLOT_FLOATS; i++) sum[i] = zero;
+        for (; k > 0 && heads[k - 1].entry == entry; k--) {
+            const gsf__step* step = steps + k - 1;
+            const size_t s = heads[k - 1].step;
+            for (size_t half = 0; half < 8; half += 4) {
+                const size_t at = 8 * s + half;
+                const gsf__vf_simd128 dy = gsf__v_load_simd128(gsf__rows_of + 8 * (s & 7) + half) - v;
+                const gsf__vf_simd128 e = gsf__v_load_simd128(gsf__columns_of + 16 * (s >> 3) + half) -
+                                          gsf__v_madd_simd128(kx, dy, u);
+                const gsf__vf_simd128 raw = gsf__v_load_simd128(step->alpha + half), T = gsf__v_load_simd128(step->T + half);
+                const gsf__vf_simd128 gr = gsf__v_load_simd128(gradient->r + at), gg = gsf__v_load_simd128(gradient->g + at);
+                const gsf__vf_simd128 gb = gsf__v_load_simd128(gradient->b + at);
+                const gsf__vf_simd128 behind = gsf__v_load_simd128(gradient->behind + at);
+                const gsf__vf_simd128 alpha = gsf__least_simd128(raw, alpha_max), w = alpha * T;
+                gsf__vf_simd128 F = gsf__v_msub_simd128(gsf__v_set_simd128(rec->r), gr, behind);
+                F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->g), gg, F);
+                F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->b), gb, F);
+                if (with_depth) {
+                    const gsf__vf_simd128 gz = gsf__v_load_simd128(gradient->z + at);
+                    F = gsf__v_madd_simd128(gsf__v_set_simd128(rec->depth), gz, F) + gsf__v_load_simd128(gradient->a + at);
+                    sum[GSF__SLOT_Z] = gsf__v_madd_simd128(w, gz, sum[GSF__SLOT_Z]);
+                }
+                gsf__v_store_simd128(gradient->behind + at, gsf__v_madd_simd128(alpha, F, behind));
+                gsf__vf_simd128 p = T * raw * F;
+                if (!straight_through) p = gsf__v_keep_simd128(gsf__v_le_simd128(raw, alpha_max), p);
+                const gsf__vf_simd128 pe = p * e, py = p * dy;
+                sum[GSF__SLOT_P] = sum[GSF__SLOT_P] + p;
+                sum[GSF__SLOT_E] = sum[GSF__SLOT_E] + pe;
+                sum[GSF__SLOT_EE] = gsf__v_madd_simd128(pe, e, sum[GSF__SLOT_EE]);
+                sum[GSF__SLOT_Y] = sum[GSF__SLOT_Y] + py;
+                sum[GSF__SLOT_EY] = gsf__v_madd_simd128(pe, dy, sum[GSF__SLOT_EY]);
+                sum[GSF__SLOT_YY] = gsf__v_madd_simd128(py, dy, sum[GSF__SLOT_YY]);
+                sum[GSF__SLOT_R] = gsf__v_madd_simd128(w, gr, sum[GSF__SLOT_R]);
+                sum[GSF__SLOT_G] = gsf__v_madd_simd128(w, gg, sum[GSF__SLOT_G]);
+                sum[GSF__SLOT_B] = gsf__v_madd_simd128(w, gb, sum[GSF__SLOT_B]);
+                if (with_abs) {
+                    const gsf__vf_simd128 dv = gsf__v_madd_simd128(gsf__v_set_simd128(conic_b), pe,
+                                                                   gsf__v_set_simd128(conic_q) * py);
+                    sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] + gsf__v_abs_simd128(pe);
+                    sum[GSF__SLOT_ABS_Y] = sum[GSF__SLOT_ABS_Y] + gsf__v_abs_simd128(dv);
+                }
+            }
+        }
+        const size_t slot = tile->pairs[entry].slot;
+        sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] * gsf__v_set_simd128(conic_a);
+        for (int i = 0; i < GSF__SLOT_FLOATS; i += 4) { // complete: an entry's steps are all in one bucket
+            gsf__v_transpose_simd128(sum + i);
+            gsf__v_store_simd128(slots + GSF__SLOT_FLOATS * slot + i, (sum[i] + sum[i + 2]) + (sum[i + 1] + sum[i + 3]));
+        }
+        slot_used[slot] = 1;
+    }
+}
+
+static void gsf__reverse_simd128(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
+                                 gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int flags) {
+    if (flags == 0)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0, 0);
+    else if (flags == GSF__WITH_DEPTH)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 0);
+    else if (flags & GSF__STRAIGHT_THROUGH)
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1, 1);
+    else
+        gsf__reverse_body_simd128(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
+}
+
+#endif // GSF__SIMD128
+
 static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
     const gsf__raster_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__blend), GSF__WIDE_KERNEL_OF(level, gsf__keep),
                                          GSF__WIDE_KERNEL_OF(level, gsf__reverse)};
@@ -8927,6 +9201,7 @@ static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_GATHER
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_GATHER
 
@@ -8971,6 +9246,7 @@ GSF__V_INLINE void GSF__V(gsf__add_column)(float* rows, size_t stride, gsf__vf v
 // Sums the slots of each splat from i on, in double and in tile order, into the first GSF__SLOT_FLOATS columns. Returns
 // a bit for every splat that has a slot in use.
 GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i, size_t count, gsf__vf columns[16]) {
+    const size_t row = GSF__SLOT_FLOATS;
     enum { WIDE = GSF__LANES / GSF__HALVES };
     uint32_t touched = 0;
     for (size_t l = 0; l < GSF__LANES; l++) {
@@ -8981,7 +9257,7 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
                 const size_t pair = r->splat_pairs[s];
                 if (!r->slot_used[pair]) continue;
                 const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
-                for (size_t k = 0; k < GSF__SLOT_FLOATS / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
+                for (size_t k = 0; k < row / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
                 touched |= 1u << l;
             }
         }
@@ -9173,8 +9449,8 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
     const size_t end = gsf__splat_chunk_end(job->r, chunk);
-    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__KERNEL_OF(job->level, GSF__LANES))
-        GSF__KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__LANE_KERNEL_OF(job->level, GSF__LANES))
+        GSF__LANE_KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
 }
 
 // ---- >>render ------------------------------------------------------------------
@@ -9606,6 +9882,7 @@ static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) 
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_LOSS
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_LOSS
@@ -9776,6 +10053,16 @@ GSF__TARGET_AVX512 static void gsf__loss_across_avx512(const float* v, size_t n,
 }
 #undef GSF__LOSS_BETWEEN
 
+#elif GSF__SIMD128
+static void gsf__loss_across_simd128(const float* v, size_t n, float* sums) {
+    const gsf__vf_simd128 middle = gsf__v_set_simd128(gsf__loss_window[0]);
+    for (size_t i = 0; i < n; i += 4, v += 4) {
+        gsf__vf_simd128 s = middle * gsf__v_load_simd128(v);
+        for (int k = 1; k <= GSF__LOSS_RADIUS; k++)
+            s = gsf__loss_taps_simd128(k, gsf__v_load_simd128(v - 3 * k), gsf__v_load_simd128(v + 3 * k), s);
+        gsf__v_store_simd128(sums + i, s);
+    }
+}
 #endif
 
 static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
@@ -10183,7 +10470,7 @@ static void gsf__model_columns(const gsf__model* model, gsf__column out[GSF__COL
         const gsf__group* group = &model->groups[g];
         float* const arrays[4] = {group->value, group->m, group->v, group->grad};
         for (int k = 0; k < 4; k++) {
-            gsf__column* column = out + (k < 3 ? k * GSF__GROUPS : GSF__COLUMNS - GSF__GROUPS) + g;
+            gsf__column* column = out + (k < 3 ? k * GSF__GROUPS : (int)GSF__COLUMNS - (int)GSF__GROUPS) + g;
             column->data = (char*)arrays[k];
             column->row = group->width * sizeof(float);
         }
@@ -10225,10 +10512,10 @@ static double gsf__exponential_rate(int32_t step, double first, double last, int
     double delay = 1.0;
     if (delay_steps > 0) {
         const double u = step < delay_steps ? (double)step / delay_steps : 1.0;
-        delay = delay_factor + (1.0 - delay_factor) * sin(1.5707963267948966 * u);
+        delay = delay_factor + (1.0 - delay_factor) * gsf__sin_f64(1.5707963267948966 * u);
     }
     const double t = step < max_steps ? (double)step / max_steps : 1.0;
-    return delay * exp(log(first) * (1.0 - t) + log(last) * t);
+    return delay * gsf__exp_f64(gsf__log_f64(first) * (1.0 - t) + gsf__log_f64(last) * t);
 }
 
 typedef struct gsf__adam_rates { // learning rates of one step
@@ -10290,6 +10577,7 @@ static uint32_t gsf__count_bits(uint32_t bits) {
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_ADAM
+#define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
 #undef GSF__KERNELS_ADAM
@@ -10368,12 +10656,12 @@ GSF__V_KERNEL int GSF__V(gsf__lazy_catch_up)(float* value, float* m, float* v, s
                                              const gsf__rest* rest) {
     const gsf__vf zero = gsf__v_set(0.0f), least = gsf__v_set(GSF__LAZY_LEAST_V);
     const size_t whole = n - n % GSF__LANES;
-    gsf__vm small = gsf__vm_of_bits(0);
+    gsf__vm tiny = gsf__vm_of_bits(0);
     for (size_t i = 0; i < n; i += GSF__LANES) {
         const gsf__vf mi = gsf__v_load_first(m + i, n - i), vi = gsf__v_load_first(v + i, n - i);
-        small = gsf__vm_or(small, gsf__vm_not(gsf__vm_or(gsf__v_eq(mi, zero), gsf__v_ge(vi, least))));
+        tiny = gsf__vm_or(tiny, gsf__vm_not(gsf__vm_or(gsf__v_eq(mi, zero), gsf__v_ge(vi, least))));
     }
-    if (gsf__vm_bits(small)) return 0;
+    if (gsf__vm_bits(tiny)) return 0;
     for (size_t i = 0; i < whole; i += GSF__LANES)
         GSF__V(gsf__lazy_vector)(value + i, m + i, v + i, rates + i, rest, GSF__LANES);
     if (whole < n) GSF__V(gsf__lazy_vector)(value + whole, m + whole, v + whole, rates + whole, rest, n - whole);
@@ -10393,7 +10681,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->catch_up = GSF__WIDE_KERNEL_OF(level, gsf__lazy_catch_up);
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
     const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
-    double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
+    double power1 = gsf__power_f64(0.9, (uint64_t)t), power2 = gsf__power_f64(0.999, (uint64_t)t);
+    double decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
     for (int32_t n = 1; n <= GSF__REST_MOST && n <= t; n++) {
         gsf__rest* rest = &lazy->rests[n];
         const double c1 = 1.0 - power1, c2 = sqrt(1.0 - power2);
@@ -10442,7 +10731,7 @@ static void gsf__lazy_all_chunk(void* arg, size_t chunk, int32_t worker) { // br
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     (void)worker;
     const size_t end = gsf__model_blocks(gsf__model_chunk_end(lazy->model->count, chunk));
-    for (size_t b = chunk * (GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
+    for (size_t b = chunk * ((size_t)GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
 }
 
 // Writes up-to-date SH to the gradient buffer, which is free between steps, and leaves the model's SH unchanged.
@@ -10516,8 +10805,8 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     gsf__adam_job job;
     memset(&job, 0, sizeof job);
     job.model = model;
-    const double correction1 = 1.0 - pow(0.9, t);
-    job.inv_correction2 = (float)(1.0 / sqrt(1.0 - pow(0.999, t)));
+    const double correction1 = 1.0 - gsf__power_f64(0.9, (uint64_t)t);
+    job.inv_correction2 = (float)(1.0 / sqrt(1.0 - gsf__power_f64(0.999, (uint64_t)t)));
     job.rates[GSF__MEANS] = (float)(rates->means / correction1);
     job.rates[GSF__SCALES] = (float)(rates->scales / correction1);
     job.rates[GSF__QUATS] = (float)(rates->quats / correction1);
@@ -10604,7 +10893,7 @@ static float gsf__densify_cap(const gsf__model* model, float threshold, size_t r
 // Sets model->action of every splat and counts clones and splits. If max_splats leaves no room for all candidates,
 // those with the largest gradients are taken.
 static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule* rule, size_t* clones, size_t* splits) {
-    const float clone_log = (float)log(rule->clone_scale);
+    const float clone_log = (float)gsf__log_f64(rule->clone_scale);
     float threshold = rule->grad;
     const size_t room = rule->max_splats > model->count ? rule->max_splats - model->count : 0;
     *clones = *splits = 0;
@@ -10672,7 +10961,7 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
     gsf__model_copy_row(model, parent, child);
     float* scale = model->groups[GSF__SCALES].value + 3 * child;
     double offset[3];
-    for (int a = 0; a < 3; a++) offset[a] = exp((double)scale[a]) * normal[a];
+    for (int a = 0; a < 3; a++) offset[a] = gsf__exp_f64((double)scale[a]) * normal[a];
     gsf__densify_move(model, child, offset);
     for (int a = 0; a < 3; a++) scale[a] -= 0.47000363f; // log(1.6)
 }
@@ -10680,8 +10969,8 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
 // Gives a splat of opacity o the opacity 1 - sqrt(1 - o), of which two are as opaque as it was.
 static void gsf__densify_share(gsf__model* model, size_t i) {
     float* logit = model->groups[GSF__OPACITY].value + i;
-    const double clear = 1.0 / (1.0 + exp((double)*logit)), each = sqrt(clear > 1e-12 ? clear : 1e-12);
-    *logit = (float)(log1p(-each) - log(each));
+    const double clear = 1.0 / (1.0 + gsf__exp_f64((double)*logit)), each = sqrt(clear > 1e-12 ? clear : 1e-12);
+    *logit = (float)(gsf__log1p_f64(-each) - gsf__log_f64(each));
 }
 
 // One of the two parts of a splat with a shared opacity. side: -1 or 1.
@@ -10690,7 +10979,7 @@ static void gsf__densify_part(gsf__model* model, size_t parent, size_t child, do
     gsf__model_copy_row(model, parent, child);
     float* scale = model->groups[GSF__SCALES].value + 3 * child + longest;
     double offset[3] = {0.0, 0.0, 0.0};
-    offset[longest] = side * 0.5 * exp((double)*scale);
+    offset[longest] = side * 0.5 * gsf__exp_f64((double)*scale);
     gsf__densify_move(model, child, offset);
     *scale -= 0.41551544f; // log(0.66)
     gsf__densify_share(model, child);
@@ -10698,8 +10987,8 @@ static void gsf__densify_part(gsf__model* model, size_t parent, size_t child, do
 
 // Removes split parents and the splats to be pruned; the order of the others is kept. Resets the statistics.
 static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rule) {
-    const float opacity_logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
-    const float scale_log = rule->prune_scale > 0.0 ? (float)log(rule->prune_scale) : FLT_MAX;
+    const float opacity_logit = (float)gsf__log_f64(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const float scale_log = rule->prune_scale > 0.0 ? (float)gsf__log_f64(rule->prune_scale) : FLT_MAX;
     gsf__column columns[GSF__COLUMNS];
     gsf__model_columns(model, columns);
     size_t kept = 0;
@@ -10756,7 +11045,7 @@ enum { GSF__MCMC_MOST = 51 }; // N is clamped to this, as in gsplat
 // double is below 1e-12.
 static double gsf__mcmc_share(double transparency, uint32_t copies, double* opacity) {
     double term = 1.0, sum = 0.0;
-    *opacity = -expm1(log(transparency) / (double)copies);
+    *opacity = -gsf__expm1_f64(gsf__log_f64(transparency) / (double)copies);
     for (uint32_t j = 1; j <= copies; j++) {
         term *= -*opacity * (double)(copies - j + 1) / (double)j;
         sum -= term / sqrt((double)j);
@@ -10797,12 +11086,12 @@ static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
         if (model->visits[0][i] == 0) continue;
         float *logit = model->groups[GSF__OPACITY].value + i, *scale = model->groups[GSF__SCALES].value + 3 * i;
         const uint32_t most = GSF__MCMC_MOST, copies = model->visits[0][i] < most ? model->visits[0][i] + 1 : most;
-        const double clear = 1.0 / (1.0 + exp((double)*logit));
+        const double clear = 1.0 / (1.0 + gsf__exp_f64((double)*logit));
         double opacity;
-        const float grown = (float)log(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
-                                                       &opacity));
+        const double shared = clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON;
+        const float grown = (float)gsf__log_f64(gsf__mcmc_share(shared, copies, &opacity));
         if (opacity < least_opacity) opacity = least_opacity;
-        *logit = (float)log(opacity / (1.0 - opacity));
+        *logit = (float)gsf__log_f64(opacity / (1.0 - opacity));
         for (int a = 0; a < 3; a++) scale[a] += grown;
         gsf__model_clear_moments(model, i);
     }
@@ -10827,7 +11116,7 @@ static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, f
 
 // Needs capacity for the splats that gsf__mcmc_growth adds.
 static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) {
-    const float logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const float logit = (float)gsf__log_f64(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const size_t count = model->count;
     size_t dead = 0;
     for (size_t i = 0; i < count; i++) dead += model->groups[GSF__OPACITY].value[i] < logit;
@@ -10838,7 +11127,7 @@ static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) 
 
 // Lowers opacities above `limit` to it and zeroes the moments of all opacities.
 static void gsf__reset_opacity(gsf__model* model, double limit) {
-    const float logit = (float)log(limit / (1.0 - limit));
+    const float logit = (float)gsf__log_f64(limit / (1.0 - limit));
     gsf__group* group = &model->groups[GSF__OPACITY];
     for (size_t i = 0; i < model->count; i++)
         if (group->value[i] > logit) group->value[i] = logit;
@@ -11506,7 +11795,7 @@ static void gsf__decay_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t end = gsf__model_chunk_end(count, chunk);
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
         if (logits[i] > -30.0f) // lower ones are invisible anyway
-            logits[i] = (float)(log(job->factor) - log(exp(-(double)logits[i]) + 1.0 - job->factor));
+            logits[i] = (float)(gsf__log_f64(job->factor) - gsf__log_f64(gsf__exp_f64(-(double)logits[i]) + 1.0 - job->factor));
 }
 
 static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are gradient statistics needed?
@@ -11709,7 +11998,7 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
     if (d->opacity_decay > 0.0f && iteration % GSF__DECAY_INTERVAL == 0) {
         gsf__decay_job job;
         job.model = model;
-        job.factor = pow(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
+        job.factor = gsf__power_f64(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
         gsf__parallel_for(ctx, chunks, gsf__decay_chunk, &job);
     }
     if (d->mcmc && d->mcmc_noise > 0.0f) {
@@ -12311,10 +12600,10 @@ static void gsf__carry_fit(gsf__carrier* carrier, const gsf__carry_pairs* pairs,
         const double gain = (at * bb - bt * ab) / det, shift = (aa * bt - ab * at) / det;
         study->gain[channel] += 0.5f * ((float)(gain < 0.25 ? 0.25 : gain > 4.0 ? 4.0 : gain) - study->gain[channel]);
         study->offset[channel] += 0.5f * ((float)shift - study->offset[channel]);
-        log_gain += log((double)study->gain[channel]) / carrier->study_count;
+        log_gain += gsf__log_f64((double)study->gain[channel]) / carrier->study_count;
         offset += (double)study->offset[channel] / carrier->study_count;
     }
-    const float scale = (float)exp(-log_gain);
+    const float scale = (float)gsf__exp_f64(-log_gain);
     for (int32_t i = 0; i < carrier->study_count; i++) {
         carrier->studies[i].gain[channel] *= scale;
         carrier->studies[i].offset[channel] = (carrier->studies[i].offset[channel] - (float)offset) * scale;
@@ -13760,7 +14049,7 @@ static double gsf__window_agreement(const gsf_restore_window* window) {
                 }
             }
     if (explained < 0.5 * pixels) return 0.0;
-    return error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
+    return error > 0.0 ? -10.0 * log10(error / weight) : (double)INFINITY;
 }
 
 // Restores the window, or skips it (*skip = 1) if its render already agrees with the photos.
@@ -14217,7 +14506,7 @@ static void gsf__random_point(const gsf_scene_view* view, const double* focus, u
     gsf_get_camera_c2w(camera, c2w);
     if (!focus || !gsf_project_point(camera, focus, &x, &y, &depth)) depth = 1.0;
     const double least = 0.3 * depth, most = 2.0 * depth, a = least * least * least;
-    const double z = cbrt(a + (most * most * most - a) * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i));
+    const double z = gsf__cbrt_f64(a + (most * most * most - a) * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i));
     const double u = camera->width * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 1);
     const double v = camera->height * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 2);
     x = (u - camera->cx) / camera->fx * z;

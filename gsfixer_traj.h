@@ -434,11 +434,11 @@ static void gsf__traj_slerp(const double a[4], const double b[4], double t, doub
         apart += d * d;
         along += s * s;
     }
-    const double angle = 2.0 * atan2(sqrt(apart), sqrt(along)); // at most a quarter turn, so sin(angle) is well conditioned
+    const double angle = 2.0 * gsf__atan2_f64(sqrt(apart), sqrt(along)); // at most a quarter turn: its sine is well conditioned
     double wa = 1.0 - t, wb = t;
     if (angle > 1e-9) {
-        wa = sin(angle * (1.0 - t)) / sin(angle);
-        wb = sin(angle * t) / sin(angle);
+        wa = gsf__sin_f64(angle * (1.0 - t)) / gsf__sin_f64(angle);
+        wb = gsf__sin_f64(angle * t) / gsf__sin_f64(angle);
     }
     double length = 0.0;
     for (int i = 0; i < 4; i++) {
@@ -1243,14 +1243,14 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ellipse: the up vectors of the %zu views cancel", count);
     const int axis = fabs(down[0]) >= most ? 0 : fabs(down[1]) >= most ? 1 : 2;
     for (int i = 0; i < 3; i++) down[i] = i != axis ? 0.0 : down[i] < 0.0 ? -1.0 : 1.0;
-    const double pitch = d.pitch_degrees * (two_pi / 360.0), c = cos(pitch), s = sin(pitch);
+    const double pitch = d.pitch_degrees * (two_pi / 360.0), c = gsf__cos_f64(pitch), s = gsf__sin_f64(pitch);
     for (int32_t f = 0; f < d.frames; f++) {
         double* pose = out + 16 * (size_t)f;
         const double theta = two_pi * f / d.frames;
         const double position[3] = {
-            low[0] + (high[0] - low[0]) * (cos(theta) * 0.5 + 0.5),
-            low[1] + (high[1] - low[1]) * (sin(theta) * 0.5 + 0.5),
-            d.z_variation * (z_low + (z_high - z_low) * (cos(theta + two_pi * d.z_phase) * 0.5 + 0.5))};
+            low[0] + (high[0] - low[0]) * (gsf__cos_f64(theta) * 0.5 + 0.5),
+            low[1] + (high[1] - low[1]) * (gsf__sin_f64(theta) * 0.5 + 0.5),
+            d.z_variation * (z_low + (z_high - z_low) * (gsf__cos_f64(theta + two_pi * d.z_phase) * 0.5 + 0.5))};
         const double forward[3] = {focus[0] - position[0], focus[1] - position[1], focus[2] - position[2]};
         const double rounding = 1e-12 * (gsf__traj_max_abs(focus) + gsf__traj_max_abs(position));
         if (!(gsf__traj_length(forward) > rounding) || !gsf__traj_axes(forward, down, position, pose)) {
@@ -1379,7 +1379,7 @@ GSF_API double gsf_traj_query_generative_weight(int64_t iteration, int64_t start
     if (iteration <= start) return 0.0;
     const double pi = 3.1415926535897932384626433832795;
     const double progress = ((double)iteration - (double)start) / ((double)until - (double)start);
-    if (official) return lambda * sin(progress * pi);
+    if (official) return lambda * gsf__sin_f64(progress * pi);
     const float t = (float)progress;
     return (double)((float)lambda * (t * (2.0f - t)));
 }

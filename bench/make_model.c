@@ -948,11 +948,7 @@ static gsf_result model_write_shards(model_writer* w, model_list* list) {
 
 // ---- the parts -------------------------------------------------------------------
 
-static double model_now(void) {
-    struct timespec t;
-    timespec_get(&t, TIME_UTC);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
+static double model_now(void) { return gsf__seconds(); }
 
 static gsf_result model_make_folder(gsf_context* ctx, const char* path) {
     if (model_mkdir(path) == 0 || errno == EEXIST) return GSF_OK;

@@ -10,16 +10,19 @@
 #include <stdarg.h>
 #include <stddef.h>
 #include <unistd.h>
+#ifdef _WIN32
+#include "gsfix_windows.h"
+#endif
 
 // ---- options ---------------------------------------------------------------------
 
-typedef enum option_kind { FLAG, TEXT, INT, REAL, SEED } option_kind;
+typedef enum option_kind { FLAG, TEXT, WHOLE, REAL, SEED } option_kind;
 
 typedef struct option_spec {
     const char* name;
     option_kind kind;
     size_t offset;
-    double least, most;   // INT, REAL
+    double least, most;   // WHOLE, REAL
     const char* value;    // placeholder in --help; choices are separated by |
     const char* commands; // the commands that accept the option, separated by blanks
     const char* help;
@@ -49,17 +52,17 @@ static const option_spec option_specs[] = {
     {"--conditions", TEXT, AT(conditions), 0, 0, "LIST", "evaluate",
      "dit: features of the photos that guide it, of none, 2d, 3d, both (default both); several give the table that\n"
      "compares them"},
-    {"--seeds", INT, AT(seeds), 1, 1000, "N", "evaluate",
+    {"--seeds", WHOLE, AT(seeds), 1, 1000, "N", "evaluate",
      "run everything N times, from --seed on; tables have the mean and its standard error (default 1)"},
     {"--tables", TEXT, AT(tables), 0, 0, "LIST", "evaluate",
      "which tables to make, of restoration, reconstruction, conditions, trajectories (default: all that the lists allow)"},
     {"--benchmark", TEXT, AT(benchmark), 0, 0, "dl3dv|mipnerf360", "evaluate",
      "the scenes are those of this data set, by the names of their folders: the paper's printed figures stand beside ours"},
-    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info render evaluate",
+    {"--test-every", WHOLE, AT(test_every), 2, 1e9, "N", "fix filter path masks info render evaluate",
      "hold out every Nth view by name (default 8)"},
-    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
+    {"--factor", WHOLE, AT(factor), 1, 64, "N", "info fix render filter path masks dataset evaluate",
      "use the photos in images_N/ or, if there are none, shrink them N times"},
-    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix view render filter path masks dataset evaluate",
+    {"--max-size", WHOLE, AT(max_size), 16, 65536, "PIXELS", "info fix view render filter path masks dataset evaluate",
      "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]|dit:MODEL_DIR|exec:COMMAND", "fix restore",
      "what repairs the rendered frames (fix: none by default): warp reprojects the photos; mini is a small network that\n"
@@ -81,7 +84,7 @@ static const option_spec option_specs[] = {
      "dit: save the encoded photos and the prompts of all clips to a new file, for --ref-features"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore evaluate",
      "dit: the prompt, a description of the scene (default: the model captions the first frame of each clip)"},
-    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore evaluate",
+    {"--steps", WHOLE, AT(steps), 1, 1000, "N", "fix restore evaluate",
      "dit: denoising steps (default 50; with --quality fast 10)"},
     {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore evaluate",
      "dit: solver of the denoising steps (default ddim, as published; with --quality fast unipc)"},
@@ -113,13 +116,13 @@ static const option_spec option_specs[] = {
      "only; prune, scale, rotate, jitter, color, opacity, splats trained on all photos and then perturbed in this way; all"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate|spread", "fix",
      "camera path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix view evaluate", "total number of training steps (default 1200)"},
+    {"--iterations", WHOLE, AT(iterations), 1, 1e7, "N", "fix view evaluate", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
      "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
      "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
      "photos (dense, the default with 6 photos or more); random points (random, the default if the scene has no points)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "dataset", "training steps for the reference views (default 1200)"},
-    {"--clean-iterations", INT, AT(clean_iterations), 1, 1e7, "N", "dataset",
+    {"--iterations", WHOLE, AT(iterations), 1, 1e7, "N", "dataset", "training steps for the reference views (default 1200)"},
+    {"--clean-iterations", WHOLE, AT(clean_iterations), 1, 1e7, "N", "dataset",
      "training steps for the splats that are perturbed (default 3000)"},
     {"--init", TEXT, AT(init), 0, 0, "tracks|embree|both|random", "dataset",
      "initial points for the reference views (default tracks, as in the paper)"},
@@ -144,23 +147,24 @@ static const option_spec option_specs[] = {
     {"--tasks", FLAG, AT(list_tasks), 0, 0, NULL, "dataset evaluate",
      "only print the names of the tasks (dataset: one per scene, evaluate: one per run), which gsfix_mpi distributes"},
     {"--task", TEXT, AT(task), 0, 0, "NAME", "dataset evaluate", "only do this task"},
-    {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
+    {"--eval-every", WHOLE, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
-    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
+    {"--checkpoint-every", WHOLE, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times per run and after every\n"
      "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
-    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
+    {"--checkpoint-every", WHOLE, AT(checkpoint_every), 1, 1e7, "N", "dataset evaluate",
      "write the checkpoint of a scene or run every N training steps (default: once a minute, evaluate: as fix)"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|mini[:FILE]", "view",
      "what repairs the rendered frames while the scene is trained (default none)"},
     {"--screenshot", TEXT, AT(screenshot), 0, 0, "FILE.png", "view", "train to the end, save one picture, and leave"},
     {"--orbit", REAL, AT(orbit), -360, 360, "DEGREES", "view", "with --screenshot: go around this far before"},
-    {"--spz-version", INT, AT(spz_version), 2, 4, "N", "convert", "version of a .spz file (default 3; 4 is packed with zstd)"},
+    {"--spz-version", WHOLE, AT(spz_version), 2, 4, "N", "convert",
+     "version of a .spz file (default 3; 4 is packed with zstd)"},
     {"--also", TEXT, AT(also), 0, 0, "LIST", "fix",
      "also write OUT/splats.splat (no view-dependent colour), splats.spz, splats.glb: a list of splat, spz, glb"},
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix dataset evaluate",
      "override individual settings of the trainer and of the repair loop:"},
-    {"--frames", INT, AT(frames), 2, 1e5, "N", "dataset evaluate",
+    {"--frames", WHOLE, AT(frames), 2, 1e5, "N", "dataset evaluate",
      "frames per sequence, both references included: longer captures are thinned out evenly (default 49); the captures of\n"
      "fewer photos are used as they are"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render",
@@ -174,8 +178,8 @@ static const option_spec option_specs[] = {
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
      "keep the points that a training view sees by ray (embree), by track (tracks) or by either (both, the default)"},
     {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate|spread", "path", "kind of path (default reference)"},
-    {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "total number of cameras on the path (default 120)"},
-    {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "number of clips the frames are divided into (default 1)"},
+    {"--frames", WHOLE, AT(frames), 2, 1e6, "N", "path", "total number of cameras on the path (default 120)"},
+    {"--windows", WHOLE, AT(windows), 1, 1e5, "N", "path", "number of clips the frames are divided into (default 1)"},
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
      "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
@@ -190,7 +194,7 @@ static const option_spec option_specs[] = {
     {"--prompt", TEXT, AT(prompt), 0, 0, "TEXT", "metrics", "what DIR_A shows, for overall_consistency"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics evaluate", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
-    {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
+    {"--threads", WHOLE, AT(threads), 1, 1024, "N", ALL,
      "number of workers (default: all cores); results are bit-identical for any number"},
     {"--seed", SEED, AT(seed), 0, 0, "S", ALL, "random seed (default 0)"},
     {"--json", FLAG, AT(json), 0, 0, NULL, ALL, "print one JSON object to stdout; progress always goes to stderr"},
@@ -303,7 +307,7 @@ static int set_option(gsfix_app* app, const option_spec* o, const char* value) {
                 return gsfix_misused(app, "%s %s: choose from %s", o->name, value, o->value);
             *(const char**)(void*)field = value;
             return 0;
-        case INT: {
+        case WHOLE: {
             const long long x = strtoll(value, &end, 10);
             if (errno || end == value || *end || (double)x < o->least || (double)x > o->most)
                 return gsfix_misused(app, "%s %s: expected a whole number from %.0f to %.0f", o->name, value, o->least,
@@ -1698,6 +1702,12 @@ static gsf_result quote_command(gsfix_app* app, int argc, char** argv) {
 }
 
 static void catch_interrupts(gsfix_app* app) { // the first signal requests a stop, the second one terminates the program
+#ifdef _WIN32 // where the default action comes back by itself
+    interrupted_context = &app->ctx;
+    signal(SIGINT, on_interrupt);
+    signal(SIGTERM, on_interrupt);
+    signal(SIGBREAK, on_interrupt);
+#else
     struct sigaction action;
     memset(&action, 0, sizeof action);
     action.sa_handler = on_interrupt;
@@ -1708,6 +1718,7 @@ static void catch_interrupts(gsfix_app* app) { // the first signal requests a st
     sigaction(SIGTERM, &action, NULL);
 #ifdef SIGXFSZ
     signal(SIGXFSZ, SIG_IGN); // exceeding the file size limit then fails the write, like a full disk
+#endif
 #endif
 }
 
@@ -1750,7 +1761,11 @@ int gsfix_start(int argc, char** argv, const struct gsfix_crew* crew) {
     if (!command->run) return gsfix_misused(&app, "the command %s is not in this version", argv[1]);
     app.command = command->name;
     app.started = gsfix_now();
+#ifdef _WIN32
+    app.terminal = gsfix_w_is_terminal();
+#else
     app.terminal = isatty(2) && getenv("TERM") && strcmp(getenv("TERM"), "dumb") != 0;
+#endif
     app.line_share = -1;
     app.crew = crew;
     app.o.inputs = (const char**)calloc((size_t)argc, sizeof(char*));
@@ -1762,9 +1777,17 @@ int gsfix_start(int argc, char** argv, const struct gsfix_crew* crew) {
     return code;
 }
 
-int main(int argc, char** argv) { return gsfix_start(argc, argv, NULL); }
+int main(int argc, char** argv) {
+#if defined(_WIN32) && !defined(main) // the system passes them in a code page that has not all letters
+    char** utf8 = gsfix_w_arguments(&argc);
+    if (!utf8) return fputs("gsfix: out of memory\n", stderr), 1;
+    argv = utf8;
+#endif
+    return gsfix_start(argc, argv, NULL);
+}
 
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
+#include "gsfix_windows.c" // before those that rename its functions
 #include "gsfix_dataset.c"
 #include "gsfix_evaluate.c"
 #include "gsfix_exec.c"

@@ -3,6 +3,9 @@
 #include "gsfix.h"
 
 #include <limits.h>
+#ifdef _WIN32
+#include "gsfix_windows.h"
+#endif
 #include <math.h>
 
 /* Each scene is a task with a folder of its own. K is a number of reference views, KIND is lr for splats trained on these views
@@ -1067,7 +1070,11 @@ int gsfix_run_dataset(gsfix_app* app) {
 int gsfix_is_manifest(const char* path) {
     static const char begin[] = "{\"format\":\"gsfixer ";
     char text[sizeof begin] = "";
+#ifdef _WIN32
+    FILE* file = gsfix_w_fopen(path);
+#else
     FILE* file = fopen(path, "rb");
+#endif
     const size_t n = file ? fread(text, 1, sizeof begin - 1, file) : 0;
     if (file) fclose(file);
     return n == sizeof begin - 1 && memcmp(text, begin, n) == 0;

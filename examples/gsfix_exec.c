@@ -2,6 +2,11 @@
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
+#ifdef _WIN32
+#define WIN32_LEAN_AND_MEAN
+#define NOMINMAX
+#include <windows.h>
+#else
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
@@ -10,6 +15,7 @@
 #include <unistd.h>
 #ifdef __linux__
 #include <sys/prctl.h>
+#endif
 #endif
 
 /* Contents of JOBDIR before the call:
@@ -25,15 +31,18 @@
    COMMAND is run by the shell; its standard output is redirected to stderr.
    JOBDIR is new in each round and removed afterwards with all its contents, except after a failure.
    COMMAND, its child processes and a watcher form one process group. The watcher blocks on a pipe whose write end only
-   gsfix holds: when gsfix terminates for any reason, even kill -9, the watcher reads end of file and kills the group. */
+   gsfix holds: when gsfix terminates for any reason, even kill -9, the watcher reads end of file and kills the group.
+   On Windows the shell is cmd.exe, and a job object, which ends with its last handle, takes the place of group and watcher. */
 typedef struct exec_state {
     gsfix_app* app;
     char* command;
     const char* job;
     double timeout;
     int failed;
+#ifndef _WIN32
     pid_t group; // process group, and process ID of the watcher; 0: none
     int life;    // write end of the pipe
+#endif
 } exec_state;
 
 static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -104,6 +113,81 @@ static gsf_result write_job(gsf_context* ctx, exec_state* e, const gsf_restore_w
     }
     return result == GSF_OK && w->cameras ? write_cameras(ctx, e, w) : result;
 }
+
+#ifdef _WIN32
+
+// The command line for cmd.exe, which removes the outer quotes only (/s) and runs no start-up script (/d).
+static wchar_t* command_line(gsf_context* ctx, const exec_state* e) {
+    gsf_buffer line = {0};
+    gsfix_path job = gsfix_pathf("%s", e->job); // the shell's own commands take slashes for options
+    for (char* c = job.s; *c; c++)
+        if (*c == '/') *c = '\\';
+    gsf_append_text(ctx, &line, "cmd.exe /d /s /c \"%s \"%s\"\"", e->command, job.s);
+    const int size = line.failed ? 0 : MultiByteToWideChar(CP_UTF8, 0, line.data, -1, NULL, 0);
+    wchar_t* wide = size > 0 ? (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide) : NULL;
+    if (wide) MultiByteToWideChar(CP_UTF8, 0, line.data, -1, wide, size);
+    gsf_destroy_buffer(ctx, &line);
+    return wide;
+}
+
+static HANDLE make_job(void) { // all its processes end when the last handle is closed, at the latest when this process ends
+    JOBOBJECT_EXTENDED_LIMIT_INFORMATION limits;
+    HANDLE job = CreateJobObjectW(NULL, NULL);
+    memset(&limits, 0, sizeof limits);
+    limits.BasicLimitInformation.LimitFlags = JOB_OBJECT_LIMIT_KILL_ON_JOB_CLOSE;
+    if (job) SetInformationJobObject(job, JobObjectExtendedLimitInformation, &limits, sizeof limits);
+    return job;
+}
+
+static int start_program(wchar_t* line, HANDLE job, PROCESS_INFORMATION* process) {
+    STARTUPINFOW start;
+    memset(&start, 0, sizeof start);
+    start.cb = sizeof start;
+    start.dwFlags = STARTF_USESTDHANDLES;
+    start.hStdInput = GetStdHandle(STD_INPUT_HANDLE);
+    start.hStdOutput = GetStdHandle(STD_ERROR_HANDLE); // stdout is reserved for --json
+    start.hStdError = GetStdHandle(STD_ERROR_HANDLE);
+    if (!CreateProcessW(NULL, line, NULL, NULL, TRUE, CREATE_SUSPENDED, NULL, NULL, &start, process)) return 0;
+    AssignProcessToJobObject(job, process->hProcess); // before it can start others
+    ResumeThread(process->hThread);
+    return 1;
+}
+
+static gsf_result run_program(gsf_context* ctx, exec_state* e) {
+    PROCESS_INFORMATION process;
+    wchar_t* line = command_line(ctx, e);
+    if (!line) return GSF_ERROR_OUT_OF_MEMORY;
+    fflush(NULL);
+    HANDLE job = make_job();
+    const int started = job && start_program(line, job, &process);
+    const DWORD reason = GetLastError();
+    gsf_free(ctx, line);
+    if (!started) {
+        if (job) CloseHandle(job);
+        return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: error %lu", (unsigned long)reason);
+    }
+    const double begin = gsfix_now();
+    gsf_result result = GSF_OK;
+    while (WaitForSingleObject(process.hProcess, 20) == WAIT_TIMEOUT && result == GSF_OK) {
+        if (gsf_is_cancelled(ctx)) result = gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled");
+        else if (gsfix_now() - begin > e->timeout)
+            result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped", e->command,
+                              e->timeout);
+    }
+    DWORD status = 1;
+    if (result == GSF_OK && GetExitCodeProcess(process.hProcess, &status) && status != 0)
+        result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s %s ended with status %lu", e->command, e->job,
+                          (unsigned long)status);
+    if (result != GSF_OK) TerminateJobObject(job, 1);
+    CloseHandle(process.hThread);
+    CloseHandle(process.hProcess);
+    CloseHandle(job);
+    return result;
+}
+
+static void end_group(exec_state* e) { (void)e; }
+
+#else
 
 static void watch(int life) { // runs in its own process; only async-signal-safe calls after the fork
     static const int ignored[] = {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE};
@@ -212,6 +296,8 @@ static gsf_result run_program(gsf_context* ctx, exec_state* e) {
         nanosleep(&pause, NULL);
     }
 }
+
+#endif
 
 static gsf_result read_result(gsf_context* ctx, const char* path, int32_t channels, const gsf_image* out) {
     gsf_image image;

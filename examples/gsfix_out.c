@@ -3,14 +3,19 @@
 #include "gsfix.h"
 
 #include <ctype.h>
-#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdarg.h>
-#include <sys/file.h>
-#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
+#ifdef _WIN32
+#define GSFIX_W_NAMES
+#include "gsfix_windows.h"
+#else
+#include <dirent.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#endif
 
 #ifdef __APPLE__
 #define st_ctim st_ctimespec
@@ -253,7 +258,11 @@ const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count) {
 // Opens the folder part of `name` without following links; *base is the rest of the name. Returns -1 and sets errno on
 // failure.
 static int open_folder(int root, const char* name, int make, const char** base) {
+#ifdef _WIN32
+    int at = gsfix_w_dup(root);
+#else
     int at = fcntl(root, F_DUPFD_CLOEXEC, 0);
+#endif
     for (const char* slash; at >= 0 && (slash = strchr(name, '/')) != NULL; name = slash + 1) {
         const gsfix_path part = gsfix_pathf("%.*s", (int)(slash - name), name);
         int next = -1;
@@ -451,9 +460,17 @@ static int look_at(const gsfix_out* o, int folder, const char* base, const char*
     return 0;
 }
 
+static int is_absolute(const char* name) { // as gsfix_absolute makes them
+#ifdef _WIN32
+    return name[0] == '/' || (name[0] && name[1] == ':');
+#else
+    return name[0] == '/';
+#endif
+}
+
 // Opens the folder of a name in the manifest.
 static int folder_of(const gsfix_out* o, const char* name, const char** base) {
-    if (name[0] != '/') return open_folder(o->root, name, 0, base);
+    if (!is_absolute(name)) return open_folder(o->root, name, 0, base);
     const char* slash = strrchr(name, '/');
     *base = slash + 1;
     return open(gsfix_pathf("%.*s/", (int)(slash - name), name).s, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
@@ -729,7 +746,7 @@ gsf_result gsfix_remove_stale(gsfix_app* app) {
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < o->line_count && result == GSF_OK; i++) {
         const out_line* line = o->lines + i;
-        if (strcmp(line->command, app->command) == 0 && line->name[0] != '/' && !is_claimed(o, line->name, 1))
+        if (strcmp(line->command, app->command) == 0 && !is_absolute(line->name) && !is_claimed(o, line->name, 1))
             result = gsfix_remove_output(app, line->name);
     }
     return result;
@@ -973,10 +990,10 @@ void gsfix_end_files(gsfix_app* app) {
         unlinkat(o->own, "lock", 0);
         unlinkat(o->root, ".gsfix", AT_REMOVEDIR);
     }
-    if (o->existed != SIZE_MAX) remove_made(o, app->o.out);
     const int open_ones[] = {o->manifest, o->own, o->root, o->lock};
     for (int i = 0; i < 4; i++)
         if (open_ones[i] >= 0) close(open_ones[i]);
+    if (o->existed != SIZE_MAX) remove_made(o, app->o.out);
     ctx->io = o->plain;
     while (o->line_count) drop_line(ctx, o, o->line_count - 1);
     for (size_t i = 0; i < o->input_count; i++) gsf_free(ctx, o->inputs[i].path);

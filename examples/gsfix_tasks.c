@@ -2,6 +2,11 @@
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
+#ifdef _WIN32
+#include "gsfix_windows.h"
+#define realpath(path, room) gsfix_w_realpath(path)
+#endif
+
 // ---- names -----------------------------------------------------------------------
 
 // The last part of a path that says something: nerfstudio/ and colmap/ are what DL3DV calls the folder in each scene.

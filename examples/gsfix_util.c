@@ -3,14 +3,19 @@
 #include "gsfix.h"
 
 #include <ctype.h>
-#include <dirent.h>
 #include <errno.h>
 #include <math.h>
 #include <stdarg.h>
-#include <sys/resource.h>
-#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
+#ifdef _WIN32
+#define GSFIX_W_NAMES
+#include "gsfix_windows.h"
+#else
+#include <dirent.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#endif
 
 // ---- time, memory, files ---------------------------------------------------------
 
@@ -21,14 +26,21 @@ double gsfix_now(void) {
 }
 
 double gsfix_physical_memory(void) {
-#ifdef _SC_PHYS_PAGES
+#if defined(_WIN32)
+    return gsfix_w_memory(GSFIX_W_OF_MACHINE);
+#elif defined(_SC_PHYS_PAGES)
     const long pages = sysconf(_SC_PHYS_PAGES), size = sysconf(_SC_PAGESIZE);
     if (pages > 0 && size > 0) return (double)pages * (double)size;
-#endif
     return 0.0;
+#else
+    return 0.0;
+#endif
 }
 
 uint64_t gsfix_peak_memory(void) {
+#ifdef _WIN32
+    return (uint64_t)gsfix_w_memory(GSFIX_W_PEAK);
+#else
     struct rusage usage;
     if (getrusage(RUSAGE_SELF, &usage) != 0) return 0;
 #ifdef __APPLE__
@@ -36,11 +48,14 @@ uint64_t gsfix_peak_memory(void) {
 #else
     return (uint64_t)usage.ru_maxrss * 1024u;
 #endif
+#endif
 }
 
 double gsfix_anonymous_memory(void) {
     double bytes = 0.0;
-#ifdef __linux__
+#if defined(_WIN32)
+    bytes = gsfix_w_memory(GSFIX_W_PRIVATE);
+#elif defined(__linux__)
     unsigned long resident, shared;
     FILE* file = fopen("/proc/self/statm", "r");
     if (file && fscanf(file, "%*u %lu %lu", &resident, &shared) == 2)

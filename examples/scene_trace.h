@@ -58,18 +58,18 @@ static void end_tracer(tracer* t) {
     if (t->device) rtcReleaseDevice(t->device);
 }
 
-static struct RTCRay make_ray(v3 from, v3 d, float near, float far) {
+static struct RTCRay make_ray(v3 from, v3 d, float least, float most) {
     struct RTCRay ray;
     memset(&ray, 0, sizeof ray);
     ray.org_x = from.x, ray.org_y = from.y, ray.org_z = from.z;
     ray.dir_x = d.x, ray.dir_y = d.y, ray.dir_z = d.z;
-    ray.tnear = near, ray.tfar = far;
+    ray.tnear = least, ray.tfar = most;
     ray.mask = 0xffffffffu;
     return ray;
 }
 
-static int is_crossed(const tracer* t, v3 from, v3 d, float near, float far) {
-    struct RTCRay ray = make_ray(from, d, near, far);
+static int is_crossed(const tracer* t, v3 from, v3 d, float least, float most) {
+    struct RTCRay ray = make_ray(from, d, least, most);
 #if RTC_VERSION_MAJOR < 4
     struct RTCIntersectContext context;
     rtcInitIntersectContext(&context);
@@ -80,10 +80,10 @@ static int is_crossed(const tracer* t, v3 from, v3 d, float near, float far) {
     return ray.tfar < 0.0f;
 }
 
-static int find_nearest(const tracer* t, v3 from, v3 d, float near, crossing* out) {
+static int find_nearest(const tracer* t, v3 from, v3 d, float least, crossing* out) {
     struct RTCRayHit r;
     memset(&r, 0, sizeof r);
-    r.ray = make_ray(from, d, near, INFINITY);
+    r.ray = make_ray(from, d, least, INFINITY);
     r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
 #if RTC_VERSION_MAJOR < 4
     struct RTCIntersectContext context;
@@ -242,17 +242,17 @@ static void end_tracer(tracer* t) {
 }
 
 // Distance at which a ray enters a box, infinite if it misses it.
-static float enter_box(const bvh_node* node, v3 from, v3 inverse, float near, float far) {
+static float enter_box(const bvh_node* node, v3 from, v3 inverse, float least, float most) {
     const float ax = (node->lo.x - from.x) * inverse.x, bx = (node->hi.x - from.x) * inverse.x;
     const float ay = (node->lo.y - from.y) * inverse.y, by = (node->hi.y - from.y) * inverse.y;
     const float az = (node->lo.z - from.z) * inverse.z, bz = (node->hi.z - from.z) * inverse.z;
-    const float in = maxf(maxf(minf(ax, bx), minf(ay, by)), maxf(minf(az, bz), near));
-    const float out = minf(minf(maxf(ax, bx), maxf(ay, by)), minf(maxf(az, bz), far));
+    const float in = maxf(maxf(minf(ax, bx), minf(ay, by)), maxf(minf(az, bz), least));
+    const float out = minf(minf(maxf(ax, bx), maxf(ay, by)), minf(maxf(az, bz), most));
     return in <= out * 1.0000004f ? in : INFINITY; // rounding must not lose flat boxes
 }
 
 // Moeller and Trumbore's test; edges are a hair wide, so that no ray slips between neighbours.
-static int cross_triangle(const bvh_triangle* t, v3 from, v3 d, float near, float far, crossing* out) {
+static int cross_triangle(const bvh_triangle* t, v3 from, v3 d, float least, float most, crossing* out) {
     const v3 p = cross(d, t->edge_v), q = sub(from, t->at);
     const float det = dot(t->edge_u, p);
     if (det == 0.0f) return 0;
@@ -260,54 +260,54 @@ static int cross_triangle(const bvh_triangle* t, v3 from, v3 d, float near, floa
     if (u < -1e-6f || u > 1.000001f) return 0;
     const v3 r = cross(q, t->edge_u);
     const float w = dot(d, r) * inverse, at = dot(t->edge_v, r) * inverse;
-    if (w < -1e-6f || u + w > 1.000001f || !(at > near) || !(at < far)) return 0;
+    if (w < -1e-6f || u + w > 1.000001f || !(at > least) || !(at < most)) return 0;
     out->t = at, out->u = u, out->v = w, out->triangle = t->index;
     return 1;
 }
 
 // The nearest crossing or, with `any`, the first one found.
-static int walk_tree(const tracer* t, v3 from, v3 d, float near, float far, int any, crossing* out) {
+static int walk_tree(const tracer* t, v3 from, v3 d, float least, float most, int any, crossing* out) {
     const v3 inverse = v(1.0f / (fabsf(d.x) > 1e-12f ? d.x : 1e-12f), 1.0f / (fabsf(d.y) > 1e-12f ? d.y : 1e-12f),
                          1.0f / (fabsf(d.z) > 1e-12f ? d.z : 1e-12f));
     uint32_t stack[BVH_STACK];
     const bvh_triangle* best = NULL;
     int waiting = 0;
     const bvh_node* node = t->nodes;
-    float entry = enter_box(node, from, inverse, near, far);
+    float entry = enter_box(node, from, inverse, least, most);
     for (;;) {
-        if (entry < far && node->count) {
+        if (entry < most && node->count) {
             for (uint32_t i = node->first; i < node->first + node->count; i++)
-                if (cross_triangle(t->triangles + i, from, d, near, far, out)) {
+                if (cross_triangle(t->triangles + i, from, d, least, most, out)) {
                     best = t->triangles + i;
-                    far = out->t;
+                    most = out->t;
                     if (any) return 1;
                 }
-        } else if (entry < far) {
+        } else if (entry < most) {
             const bvh_node *a = t->nodes + node->first, *b = a + 1;
-            const float in_a = enter_box(a, from, inverse, near, far), in_b = enter_box(b, from, inverse, near, far);
+            const float in_a = enter_box(a, from, inverse, least, most), in_b = enter_box(b, from, inverse, least, most);
             const bvh_node* closer = in_b < in_a ? b : a;
-            if (maxf(in_a, in_b) < far) stack[waiting++] = node->first + (closer == a);
+            if (maxf(in_a, in_b) < most) stack[waiting++] = node->first + (closer == a);
             entry = minf(in_a, in_b);
-            if (entry < far) {
+            if (entry < most) {
                 node = closer;
                 continue;
             }
         }
         if (waiting == 0) break;
         node = t->nodes + stack[--waiting];
-        entry = node->count ? near : enter_box(node, from, inverse, near, far);
+        entry = node->count ? least : enter_box(node, from, inverse, least, most);
     }
     if (best) out->face = cross(best->edge_u, best->edge_v);
     return best != NULL;
 }
 
-static int is_crossed(const tracer* t, v3 from, v3 d, float near, float far) {
+static int is_crossed(const tracer* t, v3 from, v3 d, float least, float most) {
     crossing c;
-    return walk_tree(t, from, d, near, far, 1, &c);
+    return walk_tree(t, from, d, least, most, 1, &c);
 }
 
-static int find_nearest(const tracer* t, v3 from, v3 d, float near, crossing* out) {
-    return walk_tree(t, from, d, near, INFINITY, 0, out);
+static int find_nearest(const tracer* t, v3 from, v3 d, float least, crossing* out) {
+    return walk_tree(t, from, d, least, INFINITY, 0, out);
 }
 
 #endif // GSF_USE_EMBREE

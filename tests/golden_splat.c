@@ -216,7 +216,7 @@ typedef enum kind {
     QUATERNIONS,// lengths 1e-8 .. 1e8, and zero
     SIZES,      // far below a pixel and far above the image
     TIES,       // many splats share a mean
-    FAR,        // origin and camera thousands of kilometres from zero
+    REMOTE,        // origin and camera thousands of kilometres from zero
     NEEDLES,    // aspect 1e3 .. 1e4
     KINDS
 } kind;
@@ -272,8 +272,8 @@ static random_scene random_scene_make(gsf_context* ctx, uint64_t seed) {
     const int32_t degree = (int32_t)(test_random(&state) * 4);
     CHECK_OK(ctx, gsf_splat_make(ctx, count, degree, &r.splats));
     const double far_away[3] = {4.1e6, -2.7e6, 5.3e5}, zero[3] = {0, 0, 0};
-    if (r.what == FAR) memcpy(r.splats.origin, far_away, sizeof far_away);
-    r.camera = random_camera(&state, size[0], size[1], r.what == FAR ? far_away : zero, r.what == AROUND ? 0.2 : 3);
+    if (r.what == REMOTE) memcpy(r.splats.origin, far_away, sizeof far_away);
+    r.camera = random_camera(&state, size[0], size[1], r.what == REMOTE ? far_away : zero, r.what == AROUND ? 0.2 : 3);
     r.desc.sh_bands = (int32_t)(test_random(&state) * 5);
     for (int c = 0; c < 3; c++) r.desc.background[c] = (float)test_random_in(&state, 0.1, 1);
     r.desc.antialiased = test_random(&state) < 0.4;

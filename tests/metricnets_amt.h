@@ -109,14 +109,14 @@ static void amt_check_pair(gsf_context* ctx, gsf__amt* net, const test_tensors* 
     compared += amt_compare(io, pair, "imgt_pred", &seen, "middle", 0, wide, 0, (wide - images[0].width) / 2,
                             (high - images[0].height) / 2, amt_clamp, 2e-5);
     CHECK(compared >= 4);
-    size_t wrong = 0, far = 0;
+    size_t wrong = 0, remote = 0;
     for (size_t i = 0; i < expected.count; i++) {
         const double error = fabs((double)((const uint8_t*)out.data)[i] - expected.v[i]);
         wrong += error > 0.0;
-        far += error > 1.0;
+        remote += error > 1.0;
     }
     golden_near("share of other grey levels", (double)wrong / (double)expected.count, 0.0, 5e-4);
-    CHECK(far == 0);
+    CHECK(remote == 0);
     for (int i = 0; i < seen.count; i++) free(seen.maps[i].v);
     gsf_destroy_image(ctx, &out);
     free(images[0].data);
@@ -148,8 +148,8 @@ static void amt_check_clip(gsf_context* ctx, const test_tensors* io, const char*
         golden_fail_memory(metric.kind, models, NULL, three, 3, 7);
         for (int i = 0; i < 3; i++) free(three[i].data);
     }
-    uint8_t small[48 * 48 * 3] = {0};
-    const gsf_image other = gsf_wrap_image(small, GSF_U8, 48, 48, 3);
+    uint8_t little[48 * 48 * 3] = {0};
+    const gsf_image other = gsf_wrap_image(little, GSF_U8, 48, 48, 3);
     CHECK_RESULT(ctx, gsf_nn_measure_frame(ctx, &metric, &other, NULL), GSF_ERROR_INVALID_ARGUMENT);
     gsf_nn_destroy_metric(ctx, &metric);
     metric.kind = GSF_NN_METRIC_MOTION_SMOOTHNESS;

@@ -110,7 +110,7 @@ static int viclip_check_frames(gsf_context* ctx, gsf__viclip* net, const test_te
     snprintf(key, sizeof key, "%s.feature", clip);
     test_tensor wanted = test_get_tensor(io, key);
     const int64_t side = net->grid * net->patch, count = net->samples * 3 * side * side;
-    size_t wrong = 0, far = 0;
+    size_t wrong = 0, remote = 0;
     CHECK(indices.count == (size_t)net->samples && expected.count == (size_t)count);
     for (int64_t i = 0; i < net->samples; i++) {
         const int64_t place = gsf__viclip_place(i, net->samples, (int64_t)frames.dim[0]);
@@ -122,11 +122,11 @@ static int viclip_check_frames(gsf_context* ctx, gsf__viclip* net, const test_te
     for (int64_t i = 0; i < count; i++) {
         const double error = fabs(rint(255.0 * (double)net->pixels[i]) - expected.v[i]);
         wrong += error > 0.0;
-        far += error > 1.0;
+        remote += error > 1.0;
         net->pixels[i] = (float)expected.v[i] / 255.0f;
     }
     golden_near("share of other grey levels", (double)wrong / (double)expected.count, 0.0, 5e-4);
-    CHECK(far == 0);
+    CHECK(remote == 0);
     viclip_seen seen = {io, clip, 1e-6, 0, 0};
     const gsf__nn_tap tap = {viclip_see, &seen};
     CHECK_OK(ctx, gsf__viclip_encode_frames(ctx, net, &tap, net->feature));

@@ -3,7 +3,10 @@
 #   build/        gcc, Release: all tests, and again with the scalar kernels; compile matrix; style; consumers; fuzz corpora
 #   build/asan/   clang, AddressSanitizer and UndefinedBehaviorSanitizer: all tests and fuzz corpora
 #   build/tsan/   clang, ThreadSanitizer: the threaded tests, on a pthread job system
-#   build/all/    one ctest run over the three; its log is build/all/Testing/Temporary/LastTest.log
+#   build/windows/  MinGW, under Wine: the core of the tests and gsfix
+#   build/arm/      64-bit Arm, under QEMU: the kernels' tests; with GSF_ARM_ALL=1 all tests, which takes hours
+#   build/web/      WebAssembly, in node: the kernels' tests
+#   build/all/    one ctest run over all; its log is build/all/Testing/Temporary/LastTest.log
 # Missing packages are installed with apt-get (as root or with sudo); if none is missing, the network is not used.
 # Tests that need the fox photos (../shared/data/fox beside the checkout, or GSF_FOX=folder) are skipped without them.
 # GSF_BUILD=folder replaces build/.
@@ -15,7 +18,8 @@ jobs=$(nproc 2> /dev/null || echo 2)
 started=$SECONDS
 
 packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev libzstd-dev
-    libglm-dev libopenimageio-dev libopenmpi-dev openmpi-bin libsdl2-dev xvfb xauth python3)
+    libglm-dev libopenimageio-dev libopenmpi-dev openmpi-bin libsdl2-dev xvfb xauth python3
+    gcc-mingw-w64-x86-64-posix wine wine64 gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user emscripten tcc)
 say() { printf '== %s\n' "$*"; }
 
 install_missing() {
@@ -81,8 +85,28 @@ build_tree tsan "$build/tsan" "${clang[@]}" -DGSFIXER_SANITIZE=thread -DGSFIXER_
     "-DCMAKE_CROSSCOMPILING_EMULATOR=$(tsan_launcher)"
 unset CC CXX
 
+# Other platforms, each as far as its tools are there. Wine keeps its settings in the build tree.
+trees=("$build" "$build/asan" "$build/tsan")
+export WINEPREFIX=$build/wine
+export NODE_PATH=/usr/share/nodejs:/usr/lib/nodejs # of Debian's node, whatever node is first in PATH
+kernels="test_lanes;test_maths;test_platforms;golden_splat"
+core="$kernels;test_gsfixer;test_context;test_resize;test_formats;test_traj;test_schedule;test_clips;test_scene;\
+test_few_views;test_nn_files;test_nn_kernels;test_nn_linear;test_nn_scheduler;test_nn_text;test_threads;test_names;\
+test_replace;golden_metrics;golden_traj;golden_training;golden_encoders"
+cross_tree() { # NAME TOOL FLAGS TESTS
+    command -v "$2" > /dev/null || { say "no $2 here: nothing is run on $1"; return; }
+    build_tree "$1" "$build/$1" "-DCMAKE_TOOLCHAIN_FILE=$root/tests/cross/$1.cmake" -DCMAKE_BUILD_TYPE=Cross \
+        "-DCMAKE_C_FLAGS_CROSS=$3" -DGSFIXER_EXAMPLES=OFF -DGSFIXER_BENCH=OFF "-DGSFIXER_TEST_PREFIX=$1." \
+        "-DGSFIXER_TEST_ONLY=$4" "-DGSFIXER_HOST_TESTS=$build/tests"
+    trees+=("$build/$1")
+}
+cross_tree windows x86_64-w64-mingw32-gcc -O1 "$core"
+cross_tree arm aarch64-linux-gnu-gcc -O2 "$([ -n "${GSF_ARM_ALL:-}" ] || echo "$kernels")"
+cross_tree web emcc -O2 "$kernels"
+if [ -d "$build/windows" ]; then step wine "$root/tests/cross/wine.sh" cmd /c exit; fi # makes its settings
+
 mkdir -p "$build/all"
-printf 'subdirs("%s" "%s" "%s")\n' "$build" "$build/asan" "$build/tsan" > "$build/all/CTestTestfile.cmake"
+{ printf 'subdirs('; printf '"%s" ' "${trees[@]}"; printf ')\n'; } > "$build/all/CTestTestfile.cmake"
 say "built after $((SECONDS - started)) s; testing"
 export OMP_WAIT_POLICY=passive # several programs share the cores
 export ASAN_OPTIONS=${ASAN_OPTIONS:-detect_stack_use_after_return=1:allocator_may_return_null=1}

@@ -44,9 +44,9 @@ static inline int machine_open(machine* m, gsf_cpu_level level, int reversed) {
 static inline void machine_close(machine* m) { gsf_splat_destroy_rasterizer(&m->ctx, m->rasterizer); }
 
 // One machine for each level that this computer supports, scalar first; returns their number.
-enum { MACHINES = 3 };
+enum { MACHINES = 4 };
 static inline size_t machines_open(machine levels[MACHINES]) {
-    static const gsf_cpu_level known[MACHINES] = {GSF_CPU_SCALAR, GSF_CPU_AVX2, GSF_CPU_AVX512};
+    static const gsf_cpu_level known[MACHINES] = {GSF_CPU_SCALAR, GSF_CPU_AVX2, GSF_CPU_AVX512, GSF_CPU_SIMD128};
     size_t count = 0;
     for (size_t k = 0; k < MACHINES; k++) count += (size_t)(machine_open(&levels[count], known[k], 0) != 0);
     CHECK(count > 0);

@@ -23,6 +23,7 @@ static float interesting(size_t i) {
 #define GSF__KERNELS "tests/test_lanes.c" // as gsfixer.h sees it
 #define GSF__KERNELS_CHECKS
 #define GSF__KERNELS_AVX512
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_CHECKS
 
@@ -33,6 +34,8 @@ int main(void) {
 #if GSF__X86
     if (ctx.cpu_level >= GSF_CPU_AVX2) check_lanes_avx2();
     if (ctx.cpu_level >= GSF_CPU_AVX512) check_lanes_avx512();
+#elif GSF__SIMD128
+    if (ctx.cpu_level == GSF_CPU_SIMD128) check_lanes_simd128();
 #endif
     return test_report();
 }
@@ -64,7 +67,7 @@ GSF__V_KERNEL void GSF__V(check_pairs)(const float* x, const float* y, const flo
             const double p = op == 2 ? -(double)x[i] : (double)x[i], r = op == 1 ? -(double)z[i] : (double)z[i];
             const double exact = p * (double)y[i] + r, size = fabs(p * (double)y[i]) + fabs(r); // exact products
             if (isfinite(exact) && size < 3e38)
-                CHECK(fabs((double)out[i] - exact) <= 1.2e-7 * (GSF__LANES == 1 ? size : fabs(exact)) + 1e-45);
+                CHECK(fabs((double)out[i] - exact) <= 1.2e-7 * (GSF__FUSED ? fabs(exact) : size) + 1e-45);
             else if (isnan(exact))
                 CHECK(out[i] != out[i]);
         }

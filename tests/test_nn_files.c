@@ -10,6 +10,10 @@
 #include <sys/stat.h>
 #define HAS_FOLDERS 1
 static void make_folder(const char* path) { (void)mkdir(path, 0777); }
+#elif defined(_WIN32)
+#include <direct.h>
+#define HAS_FOLDERS 1
+static void make_folder(const char* path) { (void)_mkdir(path); }
 #else
 #define HAS_FOLDERS 0
 #endif

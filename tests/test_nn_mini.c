@@ -62,13 +62,13 @@ static double* level(const twin* t, int l, const double* x, int h, int w) {
     for (int k = 0; k < t->net->blocks[l]; k++) block(t, &n->in[k], lh, lw, c, down);
     relu(down, size);
     if (l + 1 == GSF__MINI_LEVELS) return down;
-    double *low = level(t, l + 1, down, lh, lw), *y = doubles(size), *small = doubles(size);
+    double *low = level(t, l + 1, down, lh, lw), *y = doubles(size), *little = doubles(size);
     convolve(t, &n->skip, down, lh, lw, 0, 0, y);
-    convolve(t, &n->below, low, lh / 2, lw / 2, 0, 0, small);
-    for (int i = 0; i < size; i++) y[i] += small[((i / c / lw / 2) * (lw / 2) + i / c % lw / 2) * c + i % c];
+    convolve(t, &n->below, low, lh / 2, lw / 2, 0, 0, little);
+    for (int i = 0; i < size; i++) y[i] += little[((i / c / lw / 2) * (lw / 2) + i / c % lw / 2) * c + i % c];
     block(t, &n->out, lh, lw, c, y);
     relu(y, size);
-    free(down), free(low), free(small);
+    free(down), free(low), free(little);
     return y;
 }
 
@@ -217,9 +217,9 @@ static double difference(const float* a, const double* b, size_t count) { // rel
 // ---- results and gradients -------------------------------------------------------
 
 static void test_gradients(gsf_context* ctx) {
-    enum { OUT = BATCH * PIXELS * 3, ERROR = BATCH * PIXELS, EACH = 24 };
-    static float dout[OUT], derror[ERROR];
-    static double out[2][OUT], error[2][ERROR];
+    enum { RESULT = BATCH * PIXELS * 3, MISTAKE = BATCH * PIXELS, EACH = 24 };
+    static float dout[RESULT], derror[MISTAKE];
+    static double out[2][RESULT], error[2][MISTAKE];
     gsf__mini net, sizes = tiny();
     gsf__nn_params params;
     gsf__mini_run run;
@@ -231,13 +231,13 @@ static void test_gradients(gsf_context* ctx) {
     CHECK_OK(ctx, gsf__nn_make_params(ctx, &net.weights, NULL, 0, &params));
     double* values = (double*)malloc((size_t)params.count * sizeof *values);
     for (int64_t i = 0; i < params.count; i++) values[i] = (double)(params.value[i] += (float)test_random_in(&seed, -0.3, 0.3));
-    for (int i = 0; i < OUT; i++) dout[i] = (float)test_random_in(&seed, -1.0, 1.0);
-    for (int i = 0; i < ERROR; i++) derror[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    for (int i = 0; i < RESULT; i++) dout[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    for (int i = 0; i < MISTAKE; i++) derror[i] = (float)test_random_in(&seed, -1.0, 1.0);
     const twin t = {&net, &params, values};
     for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[0] + 3 * PIXELS * b, error[0] + PIXELS * b);
     CHECK_OK(ctx, gsf__mini_begin(ctx, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 0, &run)); // results without training
     CHECK_OK(ctx, gsf__mini_forward(&run, in));
-    CHECK_NEAR(difference(run.out, out[0], OUT), 0.0, 1e-6);
+    CHECK_NEAR(difference(run.out, out[0], RESULT), 0.0, 1e-6);
     gsf__mini_end(&run);
     float* grad = (float*)malloc((size_t)params.count * sizeof *grad);
     for (int k = 0; k < 2; k++) {
@@ -248,8 +248,8 @@ static void test_gradients(gsf_context* ctx) {
         CHECK_OK(&others, gsf_init_context(&others));
         CHECK_OK(&others, gsf__mini_begin(&others, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 1, &run));
         CHECK_OK(&others, gsf__mini_forward(&run, in));
-        CHECK_NEAR(difference(run.out, out[0], OUT), 0.0, 1e-6);
-        CHECK_NEAR(difference(run.error, error[0], ERROR), 0.0, 1e-6);
+        CHECK_NEAR(difference(run.out, out[0], RESULT), 0.0, 1e-6);
+        CHECK_NEAR(difference(run.error, error[0], MISTAKE), 0.0, 1e-6);
         memcpy(run.dout, dout, sizeof dout);
         memcpy(run.derror, derror, sizeof derror);
         memset(params.grad, 0, (size_t)params.count * sizeof *params.grad);
@@ -270,8 +270,8 @@ static void test_gradients(gsf_context* ctx) {
                 *p = before + (side ? step : -step);
                 for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[side] + 3 * PIXELS * b, error[side] + PIXELS * b);
             }
-            for (int j = 0; j < OUT; j++) slope += (out[1][j] - out[0][j]) * (double)dout[j] / (2.0 * step);
-            for (int j = 0; j < ERROR; j++) slope += (error[1][j] - error[0][j]) * (double)derror[j] / (2.0 * step);
+            for (int j = 0; j < RESULT; j++) slope += (out[1][j] - out[0][j]) * (double)dout[j] / (2.0 * step);
+            for (int j = 0; j < MISTAKE; j++) slope += (error[1][j] - error[0][j]) * (double)derror[j] / (2.0 * step);
             *p = before;
             miss += (slope - (double)grad[params.at[i] + k]) * (slope - (double)grad[params.at[i] + k]);
             size += slope * slope;

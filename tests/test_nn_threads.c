@@ -24,10 +24,10 @@ static gsf_nn_tensor make_weight(const float* v, int64_t a, int64_t b, int64_t c
 // ---- kernels -----------------------------------------------------------------------
 
 static void run_linear(gsf_context* ctx, run_output* run) {
-    enum { ROWS = 333, IN = 160, OUT = 272 };
+    enum { ROWS = 333, SOURCE = 160, RESULT = 272 };
     stage_output* out = begin_stage(run, "linear");
-    float *x = make_floats(ROWS * IN, 0), *w = make_floats(OUT * IN, 1), *y = make_floats(ROWS * OUT, 2);
-    const gsf_nn_tensor weight = make_weight(w, OUT, IN, 0);
+    float *x = make_floats(ROWS * SOURCE, 0), *w = make_floats(RESULT * SOURCE, 1), *y = make_floats(ROWS * RESULT, 2);
+    const gsf_nn_tensor weight = make_weight(w, RESULT, SOURCE, 0);
     gsf__nn_quantized quantized;
     gsf__nn_linear_desc d;
     memset(&d, 0, sizeof d);
@@ -43,10 +43,10 @@ static void run_linear(gsf_context* ctx, run_output* run) {
     d.rows = ROWS;
     if (CHECK_OK(ctx, gsf__nn_quantize_weight(ctx, &weight, 0, &quantized))) {
         CHECK_OK(ctx, gsf__nn_run_linear_int8(ctx, NULL, &d, &quantized));
-        add(out, quantized.data, OUT * IN);
+        add(out, quantized.data, RESULT * SOURCE);
         gsf__nn_destroy_quantized(ctx, &quantized);
     }
-    add_floats(out, y, ROWS * OUT);
+    add_floats(out, y, ROWS * RESULT);
     free(x);
     free(w);
     free(y);
@@ -93,11 +93,11 @@ static void run_norms(gsf_context* ctx, run_output* run) {
 }
 
 static void run_convolution(gsf_context* ctx, run_output* run) {
-    enum { FRAMES = 3, H = 19, W = 22, IN = 20, OUT = 24 };
+    enum { FRAMES = 3, H = 19, W = 22, SOURCE = 20, RESULT = 24 };
     stage_output* out = begin_stage(run, "convolution");
-    float *x = make_floats(FRAMES * H * W * IN, 9), *w = make_floats(OUT * IN * 27, 10);
-    float* y = make_floats(FRAMES * H * W * OUT, 11);
-    const gsf_nn_tensor weight = make_weight(w, OUT, IN, 3);
+    float *x = make_floats(FRAMES * H * W * SOURCE, 9), *w = make_floats(RESULT * SOURCE * 27, 10);
+    float* y = make_floats(FRAMES * H * W * RESULT, 11);
+    const gsf_nn_tensor weight = make_weight(w, RESULT, SOURCE, 3);
     gsf__nn_conv_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
@@ -108,7 +108,7 @@ static void run_convolution(gsf_context* ctx, run_output* run) {
     d.accumulate = 1;
     d.y = y;
     CHECK_OK(ctx, gsf__nn_convolve(ctx, NULL, &d));
-    add_floats(out, y, FRAMES * H * W * OUT);
+    add_floats(out, y, FRAMES * H * W * RESULT);
     free(x);
     free(w);
     free(y);

@@ -74,11 +74,7 @@ static void print_table(void) {
     }
 }
 
-static double now(void) {
-    struct timespec t;
-    timespec_get(&t, TIME_UTC);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
+static double now(void) { return gsf__seconds(); }
 
 // One line with the worst values of the rows from `first` on.
 static void print_worst(FILE* out, const char* test, size_t first, double seconds) {

@@ -1887,7 +1887,7 @@ int main(void) {
     test_sort(&ctx);
     scene s = make_scene(&ctx);
     test_loss_derivative(&ctx);
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) test_loss_accuracy((gsf_cpu_level)level);
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_SIMD128; level++) test_loss_accuracy((gsf_cpu_level)level);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_loss_weights((gsf_cpu_level)level);
     test_smoothness_derivative(&ctx);
     test_adam_rejects(&ctx);

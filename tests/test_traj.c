@@ -18,12 +18,12 @@ static void* take(size_t bytes) { // exact
 
 // ---- scenes --------------------------------------------------------------------
 
-enum { POINTS = 60 };
+enum { CURVE_POINTS = 60 };
 
 typedef struct scene {
     size_t count;
     gsf_camera cameras[32];
-    double points[3 * POINTS];
+    double points[3 * CURVE_POINTS];
 } scene;
 
 static gsf_camera camera_at(const double pose[16]) {
@@ -45,7 +45,7 @@ static void make_scene(scene* s, size_t count) {
         CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
         s->cameras[i] = camera_at(pose);
     }
-    for (int i = 0; i < 3 * POINTS; i++) s->points[i] = uniform(-1.0, 1.0) * (i % 3 == 1 ? 0.2 : i % 3 ? 0.6 : 1.0);
+    for (int i = 0; i < 3 * CURVE_POINTS; i++) s->points[i] = uniform(-1.0, 1.0) * (i % 3 == 1 ? 0.2 : i % 3 ? 0.6 : 1.0);
 }
 
 static void move_scene(const scene* s, double scale, const double offset[3], scene* out) {
@@ -56,7 +56,7 @@ static void move_scene(const scene* s, double scale, const double offset[3], sce
         for (int k = 0; k < 3; k++) pose[12 + k] = pose[12 + k] * scale + offset[k];
         gsf_set_camera_c2w(&out->cameras[i], pose);
     }
-    for (int i = 0; i < 3 * POINTS; i++) out->points[i] = s->points[i] * scale + offset[i % 3];
+    for (int i = 0; i < 3 * CURVE_POINTS; i++) out->points[i] = s->points[i] * scale + offset[i % 3];
 }
 
 typedef struct path { // result of one call in memory of exactly the promised size
@@ -174,7 +174,7 @@ static void test_all_sizes(void) {
             desc.window_length = length;
             desc.seed = test_random_bits(&rng);
             desc.round = (int32_t)(test_random_bits(&rng) % 8);
-            if (test_random_bits(&rng) % 2) { desc.points = s.points; desc.point_count = POINTS; }
+            if (test_random_bits(&rng) % 2) { desc.points = s.points; desc.point_count = CURVE_POINTS; }
             desc.official = desc.kind == GSF_TRAJ_REFERENCE && length % 3 == 1 && length >= 7 && length < 85 &&
                             test_random_bits(&rng) % 2;
             if (!desc.official && test_random_bits(&rng) % 2) {
@@ -293,7 +293,7 @@ static void test_invariance(void) {
         memset(&desc, 0, sizeof desc);
         desc.kind = (gsf_traj_kind)(trial % 4);
         desc.round = trial % 5;
-        if (trial % 2) { desc.points = s.points; desc.point_count = POINTS; }
+        if (trial % 2) { desc.points = s.points; desc.point_count = CURVE_POINTS; }
         check_following(&s, &desc, 1e-3, none, 1e-11);
         check_following(&s, &desc, 1e3, none, 1e-11);
         check_following(&s, &desc, 1.0, near_by, 1e-11);
@@ -536,13 +536,14 @@ static void test_outliers(void) {
         memset(&desc, 0, sizeof desc);
         desc.kind = trial % 2 ? GSF_TRAJ_ELLIPSE : GSF_TRAJ_REFERENCE;
         desc.points = s.points;
-        desc.point_count = POINTS - 1;
+        desc.point_count = CURVE_POINTS - 1;
         path without = sample(s.cameras, s.count, &desc);
-        static const double far[] = {10.0, 40.0, 1e4, 1e30};
+        static const double remote[] = {10.0, 40.0, 1e4, 1e30};
         const double direction[3] = {uniform(-1.0, 1.0), uniform(-1.0, 1.0), uniform(-1.0, 1.0)};
-        desc.point_count = POINTS;
+        desc.point_count = CURVE_POINTS;
         for (int k = 0; k < 4; k++) {
-            for (int i = 0; i < 3; i++) s.points[3 * (POINTS - 1) + i] = far[k] * (direction[i] + (direction[i] < 0 ? -1 : 1));
+            for (int i = 0; i < 3; i++)
+                s.points[3 * (CURVE_POINTS - 1) + i] = remote[k] * (direction[i] + (direction[i] < 0 ? -1 : 1));
             path with = sample(s.cameras, s.count, &desc);
             CHECK(with.result == without.result);
             double turned = 1.0;
@@ -553,7 +554,7 @@ static void test_outliers(void) {
                 turned = fmin(turned, a[8] * b[8] + a[9] * b[9] + a[10] * b[10]);
             }
             if (desc.kind == GSF_TRAJ_ELLIPSE && !CHECK(turned > cos(0.2)))
-                fprintf(stderr, "trial %d, point at %g: a frame turns by %.3g degrees\n", trial, far[k],
+                fprintf(stderr, "trial %d, point at %g: a frame turns by %.3g degrees\n", trial, remote[k],
                         acos(turned) * 57.2957795);
             drop(&with);
         }
@@ -637,10 +638,10 @@ static void test_not_finite(void) {
             desc.kind = (gsf_traj_kind)kind;
             desc.window_length = 10;
             desc.points = s.points;
-            desc.point_count = POINTS;
+            desc.point_count = CURVE_POINTS;
             gsf_camera intrinsics = s.cameras[0];
             desc.intrinsics = &intrinsics;
-            double* fields[4 * 20 + 3 * POINTS + 4]; // every input number
+            double* fields[4 * 20 + 3 * CURVE_POINTS + 4]; // every input number
             size_t n = 0;
             for (size_t i = 0; i < 4; i++) {
                 for (int k = 0; k < 16; k++) fields[n++] = &s.cameras[i].w2c[k];
@@ -649,7 +650,7 @@ static void test_not_finite(void) {
                 fields[n++] = &s.cameras[i].cx;
                 fields[n++] = &s.cameras[i].cy;
             }
-            for (int i = 0; i < 3 * POINTS; i++) fields[n++] = &s.points[i];
+            for (int i = 0; i < 3 * CURVE_POINTS; i++) fields[n++] = &s.points[i];
             fields[n++] = &intrinsics.fx;
             fields[n++] = &intrinsics.cy;
             for (size_t i = 0; i < n; i++) {

@@ -90,10 +90,10 @@ static void test_neighbours(void) {
     double* points = (double*)malloc(many * 3 * sizeof(double));
     for (int kind = 0; kind < CLOUD_KINDS; kind++) {
         make_cloud(kind, many, points);
-        const double start = gsf__vis_seconds();
+        const double start = gsf__seconds();
         gsf__knn_tree tree;
         CHECK_OK(&ctx, gsf__knn_build(&ctx, points, many, NULL, &tree));
-        const double built = gsf__vis_seconds();
+        const double built = gsf__seconds();
         double sum = 0.0;
         for (size_t i = 0; i < many; i++) {
             double distance2[12];
@@ -103,7 +103,7 @@ static void test_neighbours(void) {
         }
         CHECK(isfinite(sum));
         printf("neighbours: cloud %d, %zu points: tree %.2f s, 12 nearest of all %.2f s\n", kind, many, built - start,
-               gsf__vis_seconds() - built);
+               gsf__seconds() - built);
         gsf__arena_free(&tree.arena);
     }
     free(points);
@@ -330,13 +330,13 @@ static void test_walls(void) {
 
 // The definition of the filter, without any search structure: keep[i], and near[i] = 1 where rounding may decide.
 static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t count, const gsf_visibility_desc* options,
-                          uint8_t* keep, uint8_t* near) {
+                          uint8_t* keep, uint8_t* beside) {
     gsf_visibility_desc desc = gsf__visibility_desc_defaults(options);
     const float tolerance = desc.tolerance, close = 1e-4f;
     gsf_visibility_stats stats;
     gsf__vis_job job;
     memset(keep, 0, scene->point_count);
-    memset(near, 0, scene->point_count);
+    memset(beside, 0, scene->point_count);
     CHECK_OK(&ctx, gsf__vis_begin(&ctx, scene, views, count, &desc, keep, &job, &stats));
     for (size_t e = 0; e < count; e++) {
         gsf__vis_look(&ctx, &job, e);
@@ -355,8 +355,8 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
                 }
             }
             keep[row] |= cover[1] < limit;
-            near[row] |= cover[1] > 0.0 && fabs(cover[1] - limit) < (double)close;
-            if (tolerance == 0.0f) near[row] |= (cover[0] < limit) != (cover[2] < limit);
+            beside[row] |= cover[1] > 0.0 && fabs(cover[1] - limit) < (double)close;
+            if (tolerance == 0.0f) beside[row] |= (cover[0] < limit) != (cover[2] < limit);
         }
     }
     gsf__arena_free(&job.arena);
@@ -366,9 +366,9 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
 static size_t check_naive(const gsf_scene* scene, const uint32_t* views, size_t count, const gsf_visibility_desc* options) {
     const size_t n = scene->point_count;
     const gsf_cpu_level level = ctx.cpu_level;
-    uint8_t *keep = (uint8_t*)malloc(n), *near = (uint8_t*)malloc(n), *found = (uint8_t*)malloc(n);
+    uint8_t *keep = (uint8_t*)malloc(n), *beside = (uint8_t*)malloc(n), *found = (uint8_t*)malloc(n);
     size_t undecided = 0;
-    naive_visible(scene, views, count, options, keep, near);
+    naive_visible(scene, views, count, options, keep, beside);
     for (int way = 0; way < 3; way++) { // Embree with and without AVX2, the projected discs
         gsf_visibility_desc desc = *options;
         desc.method = GSF_VISIBILITY_RAYS;
@@ -377,12 +377,12 @@ static size_t check_naive(const gsf_scene* scene, const uint32_t* views, size_t 
         CHECK_OK(&ctx, gsf_splat_filter_points(&ctx, scene, views, count, &desc, found, NULL));
         ctx.cpu_level = level;
         size_t wrong = 0;
-        for (size_t i = 0; i < n; i++) wrong += found[i] != keep[i] && !near[i];
+        for (size_t i = 0; i < n; i++) wrong += found[i] != keep[i] && !beside[i];
         if (!CHECK(wrong == 0)) fprintf(stderr, "  %zu of %zu points, way %d\n", wrong, n, way);
     }
-    for (size_t i = 0; i < n; i++) undecided += near[i];
+    for (size_t i = 0; i < n; i++) undecided += beside[i];
     free(keep);
-    free(near);
+    free(beside);
     free(found);
     return undecided;
 }
