@@ -69,8 +69,13 @@ static void check_exponentials(void) {
 
 static void check_angles(void) {
     uint64_t random = 3;
+#ifdef _WIN32 // where sin and cos are the processor's, which has too few digits of pi; same_bits.sh compares with Linux
+    const double reach = 1.5;
+#else
+    const double reach = 1e5;
+#endif
     for (int i = 0; i < 200000; i++) {
-        const double x = test_random_in(&random, -7.0, 7.0), y = test_random_in(&random, -1e5, 1e5);
+        const double x = test_random_in(&random, -1.5, 1.5), y = test_random_in(&random, -reach, reach);
         meet(gsf__sin_f64(x), sin(x));
         meet(gsf__cos_f64(x), cos(x));
         meet(gsf__sin_f64(y), sin(y));

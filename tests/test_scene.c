@@ -989,6 +989,7 @@ static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, 
               scene->views[v].image.channels == 3 && scene->views[v].image.dtype == GSF_U8);
 }
 
+#ifdef __linux__
 static void save_picture(gsf_context* ctx, const char* folder, const char* name, void* pixels, int width, int height,
                          int channels) {
     char path[1000];
@@ -996,6 +997,7 @@ static void save_picture(gsf_context* ctx, const char* folder, const char* name,
     snprintf(path, sizeof path, "%s/%s", folder, name);
     CHECK_OK(ctx, gsf_save_image(ctx, path, &image));
 }
+#endif
 
 // masks/a.png (twice the photo's size) and masks/b.jpg.png, as COLMAP names it; c.png has alpha and a mask, d.png no
 // mask. A mask with another aspect ratio and a file that is not an image are errors that name the file.
