@@ -17,7 +17,7 @@ gsfixer.h|test_resize|bicubic with a = -0.75, as OpenCV has it|s/const double a 
 gsfixer.h|golden_metrics|SSIM: constants without their squares|s/c1 = gsf__vd_set\(0\.01 \* 0\.01\), c2 = gsf__vd_set\(0\.03 \* 0\.03\)/c1 = gsf__vd_set(0.01), c2 = gsf__vd_set(0.03)/
 gsfixer_nn.h|test_nn_vae|Winograd: a sign of the lower outputs|s/\(\(u1 - u2\) - u3\) \+ b/((u1 - u2) + u3) + b/
 gsfixer_nn.h|golden_metrics|LPIPS: features are not rectified|s/return gsf__v_max\(gsf__v_set\(0\.0f\), x\); \} \/\/ a NaN remains/return x; }/
-gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = sin\(angle \* \(1\.0 - t\)\) \/ sin\(angle\);/wa = 1.0 - t;/
+gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = gsf__sin_f64\(angle \* \(1\.0 - t\)\) \/ gsf__sin_f64\(angle\);/wa = 1.0 - t;/
 gsfixer_traj.h|golden_traj|windows overlap by one frame less|s/each = shared \/ \((\w+\.)?windows - 1\);/each = shared \/ ($1windows - 1) - 1;/
 gsfixer_traj.h|test_rules|restored views weigh t^2, not t (2 - t)|s/t \* \(2\.0f - t\)/t * t/
 gsfixer_splat.h|test_rules|photos and restored views averaged together|s/densify_mean\(model->grad_sum\[k\]\[i\], model->visits\[k\]\[i\]\)/densify_mean(model->grad_sum[k][i], model->visits[0][i] + model->visits[1][i])/
