@@ -1733,21 +1733,24 @@ GSF__SHARED float gsf__exp2_f32(float x) {
 #define GSF__HALVES GSF__V(GSF__HALVES)
 #define GSF__FUSED GSF__V(GSF__FUSED)
 
-// The copy of a kernel, or of a constant, for a CPU level; LANE: of one that has a 4-lane copy; WIDE: of one that also has an
-// AVX-512 copy.
+// The copy of a kernel, or of a constant, for a CPU level. WIDE: of one that has an AVX-512 copy, too; LANE: a 4-lane copy
+// (GSF__KERNELS_SIMD128); ANY: both.
 #if GSF__X86
 #define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__WIDE_KERNEL_OF(level, name) \
     ((level) >= GSF_CPU_AVX512 ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
+#define GSF__ANY_KERNEL_OF GSF__WIDE_KERNEL_OF
 #elif GSF__SIMD128
 #define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
-#define GSF__WIDE_KERNEL_OF GSF__LANE_KERNEL_OF
+#define GSF__WIDE_KERNEL_OF GSF__KERNEL_OF
+#define GSF__ANY_KERNEL_OF GSF__LANE_KERNEL_OF
 #define GSF__LANE_KERNEL_OF(level, name) ((level) == GSF_CPU_SIMD128 ? name##_simd128 : name##_scalar)
 #else
 #define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
 #define GSF__WIDE_KERNEL_OF GSF__KERNEL_OF
 #define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
+#define GSF__ANY_KERNEL_OF GSF__KERNEL_OF
 #endif
 
 #define gsf__vf GSF__V(gsf__vf)

@@ -8014,8 +8014,8 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
     const size_t end = gsf__splat_chunk_end(job->r, chunk);
     const gsf_cpu_level level = gsf__footprint_level(job->view, job->level);
-    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__WIDE_KERNEL_OF(level, GSF__LANES))
-        GSF__WIDE_KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__ANY_KERNEL_OF(level, GSF__LANES))
+        GSF__ANY_KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
 }
 
 // ---- >>bin ---------------------------------------------------------------------
@@ -9192,8 +9192,8 @@ static void gsf__reverse_simd128(const gsf__tile* tile, const gsf__step* steps, 
 #endif // GSF__SIMD128
 
 static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
-    const gsf__raster_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__blend), GSF__WIDE_KERNEL_OF(level, gsf__keep),
-                                         GSF__WIDE_KERNEL_OF(level, gsf__reverse)};
+    const gsf__raster_kernels kernels = {GSF__ANY_KERNEL_OF(level, gsf__blend), GSF__ANY_KERNEL_OF(level, gsf__keep),
+                                         GSF__ANY_KERNEL_OF(level, gsf__reverse)};
     return kernels;
 }
 
@@ -10066,9 +10066,9 @@ static void gsf__loss_across_simd128(const float* v, size_t n, float* sums) {
 #endif
 
 static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
-    const gsf__loss_kernels kernels = {GSF__WIDE_KERNEL_OF(level, gsf__loss_load), GSF__WIDE_KERNEL_OF(level, gsf__loss_down),
-                                       GSF__WIDE_KERNEL_OF(level, gsf__loss_across), GSF__WIDE_KERNEL_OF(level, gsf__loss_map),
-                                       GSF__WIDE_KERNEL_OF(level, gsf__loss_gradient)};
+    const gsf__loss_kernels kernels = {GSF__ANY_KERNEL_OF(level, gsf__loss_load), GSF__ANY_KERNEL_OF(level, gsf__loss_down),
+                                       GSF__ANY_KERNEL_OF(level, gsf__loss_across), GSF__ANY_KERNEL_OF(level, gsf__loss_map),
+                                       GSF__ANY_KERNEL_OF(level, gsf__loss_gradient)};
     return kernels;
 }
 
@@ -10677,8 +10677,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->model = model;
     lazy->active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
     for (int i = 0; i < 48; i++) lazy->rates[i] = (float)(i < 3 ? rates->sh_dc : rates->sh_rest);
-    lazy->update = GSF__WIDE_KERNEL_OF(level, gsf__adam_update);
-    lazy->catch_up = GSF__WIDE_KERNEL_OF(level, gsf__lazy_catch_up);
+    lazy->update = GSF__ANY_KERNEL_OF(level, gsf__adam_update);
+    lazy->catch_up = GSF__ANY_KERNEL_OF(level, gsf__lazy_catch_up);
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
     const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
     double power1 = gsf__power_f64(0.9, (uint64_t)t), power2 = gsf__power_f64(0.999, (uint64_t)t);
@@ -10815,7 +10815,7 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     for (size_t i = 0; i < 16 * width; i++)
         job.sh_rates[i] = (float)((i % width < 3 ? rates->sh_dc : rates->sh_rest) / correction1);
     job.active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
-    job.update = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__adam_update);
+    job.update = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__adam_update);
     if (model->lazy) gsf__lazy_prepare(ctx->cpu_level, model->lazy, model, rates, t, sh_bands);
     const size_t chunks = gsf__model_chunks(model->count);
     gsf__parallel_for(ctx, chunks, gsf__adam_chunk, &job);
