@@ -2366,6 +2366,12 @@ GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_set_simd128(double x) {
     const gsf__vd_simd128 v = {x, x};
     return v;
 }
+GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_read_simd128(const double* p) {
+    gsf__vd_simd128 v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+GSF__INLINE_SIMD128 void gsf__vd_write_simd128(double* p, gsf__vd_simd128 x) { memcpy(p, &x, sizeof x); }
 GSF__INLINE_SIMD128 double gsf__vd_sum_simd128(gsf__vd_simd128 x) { return x[0] + x[1]; }
 GSF__INLINE_SIMD128 gsf__vd_simd128 gsf__vd_load_simd128(const float* p) {
     const gsf__vd_simd128 v = {(double)p[0], (double)p[1]};
@@ -4812,6 +4818,7 @@ typedef struct gsf__ssim_form { // of a value of SSIM
 #define GSF__KERNELS "gsfixer.h" // they are at the end of this file
 #define GSF__KERNELS_METRICS
 #define GSF__KERNELS_AVX512
+#define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_METRICS
 
@@ -4909,7 +4916,7 @@ static gsf_result gsf__pixel_mean(gsf_context* ctx, const char* what, int absolu
     job.b = b;
     job.mask = mask;
     job.absolute = absolute;
-    job.bytes = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__difference_of_bytes);
+    job.bytes = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__difference_of_bytes);
     const size_t chunks = gsf__row_chunks(a);
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
@@ -5076,9 +5083,9 @@ static gsf_result gsf__ssim_sum(gsf_context* ctx, gsf_metric kind, int contrast,
     for (int t = 0; t < job->taps; t++)
         job->weights[t] = kind == GSF_METRIC_SSIM_SKIMAGE ? 1.0 / 7.0 : half[t < 5 ? 5 - t : t - 5];
     if (kind == GSF_METRIC_SSIM_SKIMAGE || kind == GSF_METRIC_MS_SSIM || contrast) job->inset = job->radius;
-    job->square = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_square);
-    job->blur = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
-    job->value = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__ssim_value);
+    job->square = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__ssim_square);
+    job->blur = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
+    job->value = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__ssim_value);
     job->chunks_per_channel = (size_t)((a->height - 2 * job->inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
     size_t chunks = 0;
     if (!gsf__mul_size(job->chunks_per_channel, (size_t)a->channels, &chunks) ||

@@ -89,10 +89,10 @@ unset CC CXX
 trees=("$build" "$build/asan" "$build/tsan")
 export WINEPREFIX=$build/wine
 export NODE_PATH=/usr/share/nodejs:/usr/lib/nodejs # of Debian's node, whatever node is first in PATH
-kernels="test_lanes;test_maths;test_platforms;golden_splat"
+kernels="test_lanes;test_maths;test_platforms;golden_splat;golden_metrics"
 core="$kernels;test_gsfixer;test_context;test_resize;test_formats;test_traj;test_schedule;test_clips;test_scene;\
 test_few_views;test_nn_files;test_nn_kernels;test_nn_linear;test_nn_scheduler;test_nn_text;test_threads;test_names;\
-test_replace;golden_metrics;golden_traj;golden_training;golden_encoders"
+test_replace;golden_traj;golden_training;golden_encoders"
 cross_tree() { # NAME TOOL FLAGS TESTS
     command -v "$2" > /dev/null || { say "no $2 here: nothing is run on $1"; return; }
     build_tree "$1" "$build/$1" "-DCMAKE_TOOLCHAIN_FILE=$root/tests/cross/$1.cmake" -DCMAKE_BUILD_TYPE=Cross \
