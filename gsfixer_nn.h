@@ -14710,14 +14710,16 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
        the render; the render plus a free colour; per reference the photo carried through the photo's own depth, the render
        plus the reference's carried residual, and the photo at the point that the frame's depth shows.
    The output is their mean by a softmax of weights, so that the colours are those of photos, and the network has to find
-   only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made.
+   only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made,
+   and the error of the render. Where the latter is below that of renders of 35 dB the render stays as it is (gsf__mini_gate):
+   weights of a softmax are never 0, and small changes everywhere would spoil what is good already.
 
        planes of each reference -> unshuffle 2 -> 1x1 -> 3x3 -> features --+--> mean by softmax, maximum --+
                                                                             |                              v
        planes of the frame ------> unshuffle 2 -------------------------------------------------------> 3x3 -> U-Net
                                                                             |                              |
        weights of a reference's candidates <--- 1x1 <--- 3x3 <--------------+------------------------------+
-       weights of the others, free colour, log error <--- 1x1 <--------------------------------------------+
+       the others', free colour, logs of both errors <--- 1x1 <--------------------------------------------+
 
    References share all weights, so any number of them is allowed, in any order. Sizes are read from the tensors. All layers
    are convolutions of gsf__nn_convolve; the first level of the U-Net is at half the frame's size, each other at half the one
@@ -14726,7 +14728,7 @@ enum {
     GSF__MINI_LEVELS = 4,
     GSF__MINI_BLOCKS = 2,                       // residual blocks of a level on the way down, at most
     GSF__MINI_FRAME = 5, GSF__MINI_REFERENCE = 14, // planes, see gsf__mini_input
-    GSF__MINI_HEAD = 6, GSF__MINI_CHOICES = 3,  // outputs per pixel; weights per pixel and reference
+    GSF__MINI_HEAD = 7, GSF__MINI_CHOICES = 3,  // outputs per pixel; weights per pixel and reference
     GSF__MINI_MULTIPLE = 16,                    // of a frame's sides, inside the network
     GSF__MINI_MOST = 16,                        // references of a frame
     GSF__MINI_CHANNELS = 512,                   // of a layer
@@ -14866,7 +14868,8 @@ typedef struct gsf__mini_run {
     gsf__mini_planes levels[GSF__MINI_LEVELS];
     float *weight;                            // (batch, height, width, candidates)
     float *out, *error;                       // (batch, height, width, 3), not clamped; its logarithm (batch, height, width)
-    float *dframe, *dfeatures, *dhidden, *dhead, *dcommon, *dheads, *dchoices, *dout, *derror; // training: gradients
+    float *fault;                             // likewise, of the render
+    float *dframe, *dfeatures, *dhidden, *dhead, *dcommon, *dheads, *dchoices, *dout, *derror, *dfault; // training: gradients
     double* dattention;                       // training: per row, of the attention's weights and bias
 } gsf__mini_run;
 
@@ -14909,6 +14912,7 @@ static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     r->choices = gsf__nn_share(&arena, each * 4 * GSF__MINI_CHOICES);
     r->out = gsf__nn_share(&arena, 3 * pixels);
     r->error = gsf__nn_share(&arena, pixels);
+    r->fault = gsf__nn_share(&arena, pixels);
     for (int l = 0; l < GSF__MINI_LEVELS; l++) gsf__mini_lay_out_level(r, l, &arena);
     r->weight = gsf__nn_share(&arena, training * pixels * (size_t)gsf__mini_candidates(r));
     r->dframe = gsf__nn_share(&arena, training * input);
@@ -14920,6 +14924,7 @@ static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     r->dchoices = gsf__nn_share(&arena, training * each * 4 * GSF__MINI_CHOICES);
     r->dout = gsf__nn_share(&arena, training * 3 * pixels);
     r->derror = gsf__nn_share(&arena, training * pixels);
+    r->dfault = gsf__nn_share(&arena, training * pixels);
     gsf__nn_share(&arena, arena.used % 2); // doubles follow
     r->dattention = (double*)(void*)gsf__nn_share(
         &arena, training * 2 * (size_t)(r->batch * r->height / 2) * (size_t)(net->features + 1));
@@ -15149,7 +15154,17 @@ static gsf__mini_pixel gsf__mini_pixel_at(const gsf__mini_run* r, int64_t row, i
 }
 
 static const float gsf__mini_free = 0.5f;   // factor of the free colour
-static const float gsf__mini_least = -6.0f; // of the error's logarithm
+static const float gsf__mini_least = -6.0f; // of an error's logarithm
+
+static float gsf__mini_log_error(float x) { return x > 0.0f ? 0.0f : x > gsf__mini_least ? x : gsf__mini_least; }
+
+// Part of the blend's change that is made, by the logarithm of the render's expected error: none up to an error of 0.012, all
+// from 0.024 on.
+static const float gsf__mini_kept = -4.4228486f, gsf__mini_gate_slope = 1.4426950f; // log 0.012, 1 / log 2
+static float gsf__mini_gate(float fault) {
+    const float part = (fault - gsf__mini_kept) * gsf__mini_gate_slope;
+    return part >= 1.0f ? 1.0f : part <= 0.0f ? 0.0f : part; // NaN stays
+}
 
 static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
     const gsf__mini_run* r = (const gsf__mini_run*)arg;
@@ -15170,19 +15185,20 @@ static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
             to[2] = shown[12] > 0.0f ? choices[2] : -1e30f;
         }
         kernels->softmax(logits, n, 1.0f, weight);
-        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + weight[1] * gsf__mini_free * p.head[2 + c];
+        const float gate = gsf__mini_gate(p.head[6]), free = gate * weight[1] * gsf__mini_free;
+        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + free * p.head[2 + c];
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
-                const float by = weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
+                const float by = gate * weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
                 const float* d = r->shown + p.shown + k * p.next_shown + gsf__mini_offset[i];
                 for (int c = 0; c < 3; c++) out[c] += by * d[c];
             }
-        const float error = p.head[5];
-        r->error[p.fine] = error > 0.0f ? 0.0f : error > gsf__mini_least ? error : gsf__mini_least;
+        r->error[p.fine] = gsf__mini_log_error(p.head[5]);
+        r->fault[p.fine] = gsf__mini_log_error(p.head[6]);
     }
 }
 
-// Computes r->out and r->error of a batch.
+// Computes r->out, r->error and r->fault of a batch.
 GSF__SHARED gsf_result gsf__mini_forward(gsf__mini_run* r, const gsf__mini_input* inputs) {
     const gsf__mini* net = r->net;
     const int64_t frames = r->batch * r->references, coarse = r->levels[0].height * r->levels[0].width;
@@ -19605,7 +19621,10 @@ static gsf_result gsf__mini_levels_grad(gsf__mini_run* r, gsf__nn_params* params
     return GSF_OK;
 }
 
-// From dout and derror, the gradients of out and error, to those of head and choices.
+// The gradient of what is clamped to r->error or r->fault.
+static float gsf__mini_log_grad(float x, float d) { return x > gsf__mini_least && x <= 0.0f ? d : 0.0f; }
+
+// From dout, derror and dfault, the gradients of out, error and fault, to those of head and choices.
 static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
     const gsf__mini_run* r = (const gsf__mini_run*)arg;
     const int64_t n = gsf__mini_candidates(r);
@@ -19614,11 +19633,12 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
     for (int64_t x = 0; x < r->width; x++) {
         const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
         const float *dout = r->dout + 3 * p.fine, *weight = r->weight + p.fine * n;
+        const float gate = gsf__mini_gate(p.head[6]);
         float *dhead = r->dhead + (p.head - r->head), mean = 0.0f;
         memset(slope, 0, sizeof slope);
         for (int c = 0; c < 3; c++) {
             slope[1] += dout[c] * gsf__mini_free * p.head[2 + c];
-            dhead[2 + c] = weight[1] * gsf__mini_free * dout[c];
+            dhead[2 + c] = gate * weight[1] * gsf__mini_free * dout[c];
         }
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
@@ -19626,13 +19646,15 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
                 slope[2 + GSF__MINI_CHOICES * k + i] = gsf__mini_factor[i] * (dout[0] * d[0] + dout[1] * d[1] + dout[2] * d[2]);
             }
         for (int64_t k = 0; k < n; k++) mean += weight[k] * slope[k];
-        dhead[0] = weight[0] * (slope[0] - mean);
-        dhead[1] = weight[1] * (slope[1] - mean);
-        dhead[5] = p.head[5] > gsf__mini_least && p.head[5] <= 0.0f ? r->derror[p.fine] : 0.0f;
+        dhead[0] = gate * weight[0] * (slope[0] - mean);
+        dhead[1] = gate * weight[1] * (slope[1] - mean);
+        dhead[5] = gsf__mini_log_grad(p.head[5], r->derror[p.fine]);
+        dhead[6] = gsf__mini_log_grad(p.head[6], r->dfault[p.fine]);
+        if (gate > 0.0f && gate < 1.0f) dhead[6] += gsf__mini_gate_slope * mean;
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) { // a candidate that there is not has no weight
                 const int64_t at = 2 + GSF__MINI_CHOICES * k + i;
-                r->dchoices[p.choices + k * p.next_choices + i] = weight[at] * (slope[at] - mean);
+                r->dchoices[p.choices + k * p.next_choices + i] = gate * weight[at] * (slope[at] - mean);
             }
     }
 }
@@ -19715,8 +19737,8 @@ static gsf_result gsf__mini_references_grad(gsf__mini_run* r, gsf__nn_params* pa
     return gsf__mini_convolve_grad(r, params, &net->first, r->shown, frames, 0, 0, r->dhidden, 0, NULL);
 }
 
-// Adds the gradients of the weights to params->grad, after a forward pass of the same batch; r->dout and r->derror: those of
-// its results.
+// Adds the gradients of the weights to params->grad, after a forward pass of the same batch; r->dout, r->derror and r->dfault:
+// those of its results.
 GSF__SHARED gsf_result gsf__mini_backward(gsf__mini_run* r, gsf__nn_params* params) {
     gsf__parallel_for(r->ctx, (size_t)(r->batch * r->height), gsf__mini_blend_grad_row, r);
     GSF__TRY(gsf__mini_heads_grad(r, params));
@@ -19726,10 +19748,12 @@ GSF__SHARED gsf_result gsf__mini_backward(gsf__mini_run* r, gsf__nn_params* para
 
 /* The loss of a batch, mean over its frames: squared error relative to that of the render; Charbonnier's smoothed absolute
    error; absolute error of the differences between neighbours; and the negative log likelihood of the error's size under the
-   Laplace distribution that `error` describes, whose slope does not reach the colours. */
-typedef struct gsf__mini_loss { double total, relative, square, before, likelihood; } gsf__mini_loss; // before: the render's
+   Laplace distribution that `error` describes, and of the render's under that of `fault`, whose slopes do not reach the
+   colours. */
+typedef struct gsf__mini_loss { double total, relative, square, likelihood, before, fault; } gsf__mini_loss; // the render's
+                                                                                       // square and likelihood: before, fault
 
-enum { GSF__MINI_LOSS_TERMS = 5 }; // sums: charbonnier, square, the render's square, likelihood, neighbours
+enum { GSF__MINI_LOSS_TERMS = 6 }; // sums: charbonnier, square, the render's square, likelihood, neighbours, its likelihood
 
 typedef struct gsf__mini_loss_job {
     const gsf__mini_run* r;
@@ -19756,7 +19780,7 @@ static void gsf__mini_loss_row(void* arg, size_t row, int32_t worker) {
     memset(s, 0, GSF__MINI_LOSS_TERMS * sizeof *s);
     for (int64_t x = 0; x < w; x++) {
         const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
-        double size = 0.0;
+        double size = 0.0, before = 0.0;
         for (int64_t c = 0; c < 3; c++) {
             const int64_t at = 3 * p.fine + c;
             const double e = gsf__mini_miss(job, at), render = (double)p.frame[c] + 0.5 - (double)job->truth[at];
@@ -19764,10 +19788,12 @@ static void gsf__mini_loss_row(void* arg, size_t row, int32_t worker) {
             s[1] += e * e;
             s[2] += render * render;
             size += fabs(e) / 3.0;
+            before += fabs(render) / 3.0;
             if (x + 1 < w) s[4] += fabs(gsf__mini_miss(job, at + 3) - e);
             if (y + 1 < r->height) s[4] += fabs(gsf__mini_miss(job, at + 3 * w) - e);
         }
         s[3] += size * exp(-(double)r->error[p.fine]) + (double)r->error[p.fine];
+        s[5] += before * exp(-(double)r->fault[p.fine]) + (double)r->fault[p.fine];
     }
 }
 
@@ -19778,11 +19804,13 @@ static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
     const double part = 1.0 / (3.0 * job->pixels), *weight = gsf__mini_loss_weight;
     (void)worker;
     for (int64_t x = 0; x < w; x++) {
-        const int64_t pixel = (int64_t)row * w + x;
-        double size = 0.0;
+        const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
+        const int64_t pixel = p.fine;
+        double size = 0.0, before = 0.0;
         for (int64_t at = 3 * pixel; at < 3 * pixel + 3; at++) {
             const double e = gsf__mini_miss(job, at);
             double neighbours = 0.0;
+            before += fabs((double)p.frame[at - 3 * pixel] + 0.5 - (double)job->truth[at]) / 3.0;
             if (x > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3));
             if (x + 1 < w) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at + 3));
             if (y > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3 * w));
@@ -19792,12 +19820,14 @@ static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
                                           2.0 * job->relative[b] * e));
         }
         r->derror[pixel] = (float)(weight[2] / job->pixels * (1.0 - size * exp(-(double)r->error[pixel])));
+        r->dfault[pixel] = (float)(weight[2] / job->pixels * (1.0 - before * exp(-(double)r->fault[pixel])));
     }
 }
 
-static const double gsf__mini_loss_floor = 1e-2; // added to the render's squared error
+static const double gsf__mini_loss_floor = 2e-3; // added to the render's squared error
 
-// The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout and r->derror.
+// The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout,
+// r->derror and r->dfault.
 GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* truth, gsf__mini_loss* loss) {
     const int64_t rows = r->batch * r->height;
     double relative[64], batch = (double)r->batch, pixels = (double)(r->height * r->width), values = 3.0 * pixels * batch;
@@ -19817,9 +19847,10 @@ GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* tru
         loss->square += s[1] / values;
         loss->before += s[2] / values;
         loss->likelihood += s[3] / (pixels * batch);
+        loss->fault += s[5] / (pixels * batch);
         loss->total += (gsf__mini_loss_weight[0] * s[0] + gsf__mini_loss_weight[1] * s[4]) / values;
     }
-    loss->total += loss->relative + gsf__mini_loss_weight[2] * loss->likelihood;
+    loss->total += loss->relative + gsf__mini_loss_weight[2] * (loss->likelihood + loss->fault);
     gsf__parallel_for(r->ctx, (size_t)rows, gsf__mini_loss_grad_row, &job);
     gsf_free(r->ctx, job.sums);
     return GSF_OK;
@@ -19851,7 +19882,7 @@ static gsf_result gsf__mini_make_tensor(void* user, const char* name, int32_t ra
                                              ? 0.0f
                                              : (float)(normal * sqrt(1.0 / (3.0 * (double)inputs)));
         if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 0) m->values[m->used + (size_t)i] = 6.0f;
-        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 5) m->values[m->used + (size_t)i] = -3.0f;
+        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD > 4) m->values[m->used + (size_t)i] = -3.0f;
         if (strcmp(name, "reference.second.bias") == 0) m->values[m->used + (size_t)i] = 0.0f;
     }
     if (m->tensors) {

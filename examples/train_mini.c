@@ -185,12 +185,12 @@ static gsf_result train(training* t) {
         if (result == GSF_OK) result = gsf__nn_step_adam(&t->ctx, &t->params, &adam, &norm);
         if (result != GSF_OK) break;
         sum.relative += loss.relative, sum.square += loss.square, sum.before += loss.before;
-        sum.likelihood += loss.likelihood;
+        sum.likelihood += loss.likelihood, sum.fault += loss.fault;
         counted++;
         if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
-            fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f\n",
+            fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f, %.3f\n",
                     (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
-                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted);
+                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted, sum.fault / counted);
             memset(&sum, 0, sizeof sum);
             counted = 0;
         }
