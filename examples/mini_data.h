@@ -20,7 +20,7 @@ enum { DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
 typedef struct data_desc { // of all scenes
     const char* dir;
     int pixels;      // the longer side, at least, and at most 1.4 times as much; the other is two thirds of it
-    int fit;         // step of the last round
+    int fit;         // step of the last round, with few photos
 } data_desc;
 
 static int data_is_signed(int plane) { // of a reference: kept within [-1,1]
@@ -189,10 +189,12 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
     gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_EXACT);
-    desc.train.iterations = d->fit + 101;
+    const int last = count < 10 ? d->fit : 2 * d->fit; // many photos take longer
+    desc.trajectory = seed / 16 % 2 ? GSF_TRAJ_REFERENCE : GSF_TRAJ_SPREAD; // frames far from the photos, and near them
+    desc.train.iterations = last + 101;
     desc.train.seed = seed;
-    desc.first_round = d->fit / 3;
-    desc.last_round = d->fit;
+    desc.first_round = last / 3;
+    desc.last_round = last;
     desc.windows = count < DATA_WINDOWS ? (int32_t)count : DATA_WINDOWS;
     desc.window_frames = DATA_WINDOW;
     if (result == GSF_OK) result = gsf_splat_make_fixer(ctx, &desc, views, count, &start, &restorer, &fixer);
