@@ -378,6 +378,36 @@ static void test_start(gsf_context* ctx) {
     gsf__mini_close(ctx, &net);
 }
 
+// A render whose expected error is small stays as it is.
+static void test_gate(gsf_context* ctx) {
+    static float biases[4 * GSF__MINI_HEAD];
+    gsf__mini net, sizes = tiny();
+    gsf__mini_run run;
+    gsf__mini_input in;
+    double most[2] = {0.0, 0.0};
+    make_inputs(&in, 1, WIDTH, HEIGHT, REFERENCES, planes);
+    for (int closed = 0; closed < 2; closed++) {
+        CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 3, made_path()));
+        if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
+        gsf_nn_tensor* tensors = (gsf_nn_tensor*)malloc(net.weights.tensor_count * sizeof *tensors);
+        memcpy(tensors, net.weights.tensors, net.weights.tensor_count * sizeof *tensors);
+        for (int i = 0; i < 4 * GSF__MINI_HEAD; i++) biases[i] = i % GSF__MINI_HEAD < 6 ? 0.0f : closed ? -4.5f : -3.5f;
+        tensors[gsf_nn_find_tensor(&net.weights, "head.bias") - net.weights.tensors].data = biases;
+        CHECK_OK(ctx, gsf_nn_save_tensors(ctx, made_path(), tensors, net.weights.tensor_count));
+        free(tensors);
+        gsf__mini_close(ctx, &net);
+        if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
+        CHECK_OK(ctx, gsf__mini_begin(ctx, &net, 1, REFERENCES, WIDTH, HEIGHT, 0, &run));
+        CHECK_OK(ctx, gsf__mini_forward(&run, &in));
+        for (int i = 0; i < 3 * PIXELS; i++)
+            most[closed] = fmax(most[closed], fabs((double)(run.out[i] - in.frame[i / 3 * GSF__MINI_FRAME + i % 3])));
+        gsf__mini_end(&run);
+        gsf__mini_close(ctx, &net);
+    }
+    CHECK(most[0] > 0.1);
+    CHECK_NEAR(most[1], 0.0, 6e-8);
+}
+
 // The same for references in another order, but for rounding.
 static void test_order(gsf_context* ctx, const gsf__mini* net) {
     gsf__mini_input in, swapped;
@@ -573,6 +603,7 @@ int main(void) {
     }
     test_loss(&ctx);
     test_start(&ctx);
+    test_gate(&ctx);
     test_restorer(&ctx);
     test_memory();
     return test_report();
