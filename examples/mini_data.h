@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 /* A scene is a made scene (make_scene.c), splats fitted to a few of its photos by the repair loop, and frames of the loop's own
    path as a restorer gets them, just before the loop's rounds, with the photos carried into them and the ray-traced truth.
+   Frames from behind a wall, where the loop's path may go, are left out: no restorer could know that the wall is there.
    The file of a scene has one tensor, "frames": u8 (frames, height, width, 50), per pixel
 
        render 3 | alpha | nearness | truth 3 |
@@ -20,7 +21,7 @@ enum { DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
 typedef struct data_desc { // of all scenes
     const char* dir;
     int pixels;      // the longer side, at least, and at most 1.4 times as much; the other is two thirds of it
-    int fit;         // step of the last round, with few photos
+    int fit;         // step of the last round
 } data_desc;
 
 static int data_is_signed(int plane) { // of a reference: kept within [-1,1]
@@ -76,20 +77,30 @@ static float probe_exposure(const data_probe* p, const gsf_camera* camera) {
 }
 
 // The truth at a camera; the sensor's noise is that of a photo that the scene does not have.
-static gsf_result probe_truth(gsf_context* ctx, const data_probe* p, const gsf_camera* camera, uint8_t* out, float* spare) {
-    const size_t pixels = (size_t)(camera->width * camera->height);
-    photo_job job = {p->s, *camera, 1000 + p->count, out, spare, spare + pixels,
-                     probe_exposure(p, camera)};
+static gsf_result probe_truth(gsf_context* ctx, const data_probe* p, const gsf_camera* camera, uint8_t* out, float* depth,
+                              float* normal) {
+    photo_job job = {p->s, *camera, 1000 + p->count, out, depth, normal, probe_exposure(p, camera)};
     ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
     return gsf_is_cancelled(ctx) ? GSF_ERROR_CANCELLED : GSF_OK;
+}
+
+// Adds up the scores of what a reference shows, and of those that the true surface hides.
+static void probe_hidden(const gsf_carried* c, const float* depth, double* hidden, double* all) {
+    for (int64_t i = 0; i < c->depth.width * c->depth.height; i++) {
+        const float score = ((const float*)c->score.data)[i], z = ((const float*)c->depth.data)[i];
+        *all += (double)score;
+        if (depth[i] > 0.0f && depth[i] < 0.7f * z) *hidden += (double)score;
+    }
 }
 
 static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore_window* w, int32_t frame, float* planes,
                               uint8_t* truth) {
     const gsf_image* depth = w->depth + frame;
     const int64_t pixels = depth->width * depth->height;
+    float* true_depth = planes + pixels * GSF__MINI_REFERENCE;
+    double hidden = 0.0, all = 0.0;
     uint8_t* out = p->bytes + p->count * (size_t)pixels * DATA_PIXEL;
-    gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, planes);
+    gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, true_depth, planes);
     gsf__mini_plane_frame(w->color + frame, w->alpha + frame, depth, planes);
     for (int64_t i = 0; i < pixels; i++) {
         for (int k = 0; k < GSF__MINI_FRAME; k++) out[i * DATA_PIXEL + k] = data_byte(planes[i * GSF__MINI_FRAME + k], 0);
@@ -101,13 +112,16 @@ static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore
         result = w->carry_fn(w->carry_user, ctx, frame, slot, &carried);
         if (result != GSF_OK) break;
         memset(planes, 0, (size_t)(pixels * GSF__MINI_REFERENCE) * sizeof(float));
-        if (carried.reference >= 0) gsf__mini_plane_reference(&carried, depth, planes);
+        if (carried.reference >= 0) {
+            gsf__mini_plane_reference(&carried, depth, planes);
+            probe_hidden(&carried, true_depth, &hidden, &all);
+        }
         for (int64_t i = 0; i < pixels; i++)
             for (int k = 0; k < GSF__MINI_REFERENCE; k++)
                 out[i * DATA_PIXEL + DATA_FRAME + slot * GSF__MINI_REFERENCE + k] =
                     data_byte(planes[i * GSF__MINI_REFERENCE + k], data_is_signed(k));
     }
-    p->count += result == GSF_OK;
+    p->count += result == GSF_OK && hidden <= 0.3 * all;
     return result;
 }
 
@@ -122,7 +136,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
         p->room = (size_t)(pixels * DATA_PIXEL) * 3 * DATA_WINDOWS * DATA_WINDOW;
         p->bytes = (uint8_t*)gsf_alloc(ctx, p->room, 1);
     }
-    float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * GSF__MINI_REFERENCE, sizeof(float));
+    float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * (GSF__MINI_REFERENCE + 1), sizeof(float));
     uint8_t* truth = (uint8_t*)gsf_alloc(ctx, (size_t)pixels, 3);
     gsf_result result = p->bytes && planes && truth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
@@ -161,7 +175,7 @@ static make_scene_options data_options(const data_desc* d, uint64_t seed) {
 // Runs the loop with the probe until its last round is over.
 static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o,
                            data_probe* p) {
-    static const size_t views_of[8] = {3, 3, 4, 3, 5, 6, 9, 16}; // 16: splats that are nearly right
+    static const size_t views_of[8] = {3, 3, 4, 3, 5, 6, 9, 12};
     const uint64_t seed = o->seed;
     const double noise = 0.1 + 0.4 * gsf_draw_uniform(seed, 1, 6); // of poses, in pixels
     gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end};
@@ -189,12 +203,11 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
     gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_EXACT);
-    const int last = count < 10 ? d->fit : 2 * d->fit; // many photos take longer
     desc.trajectory = seed / 16 % 2 ? GSF_TRAJ_REFERENCE : GSF_TRAJ_SPREAD; // frames far from the photos, and near them
-    desc.train.iterations = last + 101;
+    desc.train.iterations = d->fit + 101;
     desc.train.seed = seed;
-    desc.first_round = last / 3;
-    desc.last_round = last;
+    desc.first_round = d->fit / 3;
+    desc.last_round = d->fit;
     desc.windows = count < DATA_WINDOWS ? (int32_t)count : DATA_WINDOWS;
     desc.window_frames = DATA_WINDOW;
     if (result == GSF_OK) result = gsf_splat_make_fixer(ctx, &desc, views, count, &start, &restorer, &fixer);
