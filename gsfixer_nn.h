@@ -18479,6 +18479,17 @@ static void gsf__conv_grad_weight(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
+// Adds the bands, which are (taps, in, out), in their order to dweight, which is (out, in, taps).
+static void gsf__conv_grad_add(const gsf__conv_grad_job* g, double* sums, float* dweight) {
+    const int64_t in = g->layer.in, out = g->layer.out, taps = gsf__conv_taps(&g->layer), size = taps * in * out;
+    memset(sums, 0, (size_t)size * sizeof *sums);
+    for (int64_t band = 0; band < g->bands; band++)
+        for (int64_t i = 0; i < size; i++) sums[i] += (double)g->sums[band * size + i];
+    for (int64_t o = 0; o < out; o++)
+        for (int64_t i = 0; i < in; i++)
+            for (int64_t t = 0; t < taps; t++) dweight[(o * in + i) * taps + t] += (float)sums[(t * in + i) * out + o];
+}
+
 // Gradients of gsf__nn_convolve.
 GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_grad_desc* d) {
     gsf__nn_conv_desc forward = *d->forward;
@@ -18498,19 +18509,17 @@ GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_gr
         const int64_t most = gsf__least(GSF__CONV_GRAD_BANDS, gsf__least(GSF__CONV_GRAD_SUMS / size, rows));
         g.band_rows = gsf__ceil_div(rows, most > 1 ? most : 1);
         g.bands = gsf__ceil_div(rows, g.band_rows);
+        double* sums = (double*)gsf_alloc(ctx, (size_t)size, sizeof *sums);
         g.sums = (float*)gsf_alloc(ctx, (size_t)g.bands, (size_t)size * sizeof(float));
-        if (!g.sums) return GSF_ERROR_OUT_OF_MEMORY;
         const int64_t pieces = gsf__ceil_div(g.layer.in, GSF__CONV_GRAD_CHANNELS);
-        gsf__parallel_for(ctx, (size_t)(g.bands * taps * pieces), gsf__conv_grad_weight, &g);
-        for (int64_t o = 0; o < g.layer.out; o++)
-            for (int64_t i = 0; i < g.layer.in; i++)
-                for (int64_t t = 0; t < taps; t++) {
-                    double sum = 0.0;
-                    for (int64_t band = 0; band < g.bands; band++)
-                        sum += (double)g.sums[((band * taps + t) * g.layer.in + i) * g.layer.out + o];
-                    d->dweight[(o * g.layer.in + i) * taps + t] += (float)sum;
-                }
+        if (g.sums && sums) {
+            gsf__parallel_for(ctx, (size_t)(g.bands * taps * pieces), gsf__conv_grad_weight, &g);
+            gsf__conv_grad_add(&g, sums, d->dweight);
+        }
+        const int failed = !g.sums || !sums;
         gsf_free(ctx, g.sums);
+        gsf_free(ctx, sums);
+        if (failed) return GSF_ERROR_OUT_OF_MEMORY;
     }
     return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * g.width, g.layer.out, d->dbias) : GSF_OK;
 }
