@@ -15188,12 +15188,13 @@ static void gsf__mini_fill_frame(void* arg, size_t frame, int32_t worker) {
     const float* render = r->frame + b * h * w * pitch;
     (void)worker;
     heights[0] = h, widths[0] = w, at[0] = 0;
-    for (int64_t i = 0; i < h * w; i++)
-        for (int k = 0; k < 4; k++) {
-            float sum = k < 3 ? 2.0f : 0.0f; // colours are kept around 0
-            for (int part = 0; part < 4; part++) sum += render[i * pitch + part * GSF__MINI_FRAME + k];
-            pyramid[4 * i + k] = sum;
-        }
+    memset(pyramid, 0, (size_t)(4 * h * w) * sizeof *pyramid);
+    for (int64_t i = 0; i < 4 * h * w; i++) {
+        const float *from = render + i / 4 * pitch + i % 4 * GSF__MINI_FRAME, alpha = from[3];
+        float* to = pyramid + i / 4 * 4;
+        for (int c = 0; c < 3; c++) to[c] += from[c] + 0.5f < alpha ? from[c] + 0.5f : alpha; // no more than white
+        to[3] += alpha;
+    }
     for (;; count++) {
         float* level = pyramid + at[count - 1];
         h = heights[count - 1], w = widths[count - 1];

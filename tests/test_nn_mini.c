@@ -166,8 +166,8 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
         convolve(t, &t->net->head_blend, heads, H, W, 0, 0, choices + k * COARSE * 12);
     }
     double* covered = doubles(4 * PIXELS);
-    for (int i = 0; i < 4 * PIXELS; i++) covered[i] = (double)in->frame[i / 4 * 5 + i % 4];
-    double* fill = fill_of(covered, HEIGHT, WIDTH);
+    for (int i = 0; i < 4 * PIXELS; i++) covered[i] = (double)fminf(in->frame[i / 4 * 5 + i % 4], in->frame[i / 4 * 5 + 3]);
+    double* fill = fill_of(covered, HEIGHT, WIDTH); // over the render
     for (int i = 0; i < PIXELS; i++) {
         const int x = i % WIDTH, row = i / WIDTH, at = (row / 2 * W + x / 2) * 4 + row % 2 * 2 + x % 2;
         double weight[CANDIDATES], sum = 0.0, *h = head + at * 7;
