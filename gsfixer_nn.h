@@ -15173,7 +15173,8 @@ static void gsf__mini_add_level(const float* level, int64_t h, int64_t w, int64_
     const int64_t ys[2] = {y / 2, gsf__least(y % 2 ? y / 2 + 1 : y > 0 ? y / 2 - 1 : 0, h - 1)};
     const int64_t xs[2] = {x / 2, gsf__least(x % 2 ? x / 2 + 1 : x > 0 ? x / 2 - 1 : 0, w - 1)};
     for (int i = 0; i < 4; i++) {
-        const float by = part * (i / 2 ? 0.25f : 0.75f) * (i % 2 ? 0.25f : 0.75f), *from = level + 4 * (ys[i / 2] * w + xs[i % 2]);
+        const float by = part * (i / 2 ? 0.25f : 0.75f) * (i % 2 ? 0.25f : 0.75f);
+        const float* from = level + 4 * (ys[i / 2] * w + xs[i % 2]);
         for (int c = 0; c < 3; c++) color[c] += by * from[c];
     }
 }

@@ -82,7 +82,8 @@ class Mini:
         count = shown.shape[1]
         render = frame[:, None, :3]
         seen, valid = (shown[:, :, 6:7] > 0).float(), (shown[:, :, 12:13] > 0).float()
-        photo, residual, back = seen * (shown[:, :, :3] - render), seen * shown[:, :, 3:6], valid * (shown[:, :, 9:12] - render)
+        photo, residual = seen * (shown[:, :, :3] - render), seen * shown[:, :, 3:6]
+        back = valid * (shown[:, :, 9:12] - render)
         planes = torch.cat([2 * photo, 4 * residual, shown[:, :, 6:7], seen * shown[:, :, 7:9], 2 * back, valid,
                             valid * shown[:, :, 13:14]], 2)
         planes = self.unshuffle(planes.flatten(0, 1)).to(memory_format=self.memory)
@@ -153,7 +154,8 @@ def check(net, frames):
             frame, shown, truth = planes_of(frames[i:i + 1])
             h, w = frame.shape[2:]
             pad = (0, -w % 16, 0, -h % 16)
-            out = net.forward(F.pad(frame, pad, "replicate"), F.pad(shown.flatten(1, 2), pad, "replicate").unflatten(1, (3, 14)))[0]
+            shown = F.pad(shown.flatten(1, 2), pad, "replicate").unflatten(1, (REFERENCES, REFERENCE))
+            out = net.forward(F.pad(frame, pad, "replicate"), shown)[0]
             sums += decibels(frame[:, :3], truth), decibels(out[..., :h, :w].clamp(0, 1), truth)
     return sums / len(frames)
 
@@ -200,7 +202,8 @@ def main():
                            "--steps", "60", "--threads", "1"], check=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
                           text=True).stdout
     frames = tensors_of(os.path.join(options.data, options.check + ".safetensors"))["frames"]
-    print(text.splitlines()[0] + "; PyTorch %s: %.2f -> %.2f dB" % ((torch.__version__,) + tuple(check(Mini(weights, 0), frames))))
+    print(text.splitlines()[0])
+    print("PyTorch %s: %.2f -> %.2f dB" % ((torch.__version__,) + tuple(check(Mini(weights, 0), frames))))
     times = {"train_mini": [], "PyTorch, channels first": [], "PyTorch, channels last": []}
     for _ in range(options.runs):
         times["train_mini"].append(time_program(options, options.steps))

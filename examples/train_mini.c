@@ -190,7 +190,8 @@ static gsf_result train(training* t) {
         if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
             fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f, %.3f\n",
                     (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
-                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted, sum.fault / counted);
+                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted,
+                    sum.fault / counted);
             memset(&sum, 0, sizeof sum);
             counted = 0;
         }
