@@ -14707,7 +14707,7 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
 // ---- >>nn mini ------------------------------------------------------------------
 
 /* A small network that repairs a frame by blending what photos show in it. For every pixel it weighs candidates:
-       the render; the render, filled where splats are missing, plus a free colour; per reference the photo carried through the photo's own depth, the render
+       the render; the render plus a free colour; per reference the photo carried through the photo's own depth, the render
        plus the reference's carried residual, and the photo at the point that the frame's depth shows.
    The output is their mean by a softmax of weights, so that the colours are those of photos, and the network has to find
    only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made,
@@ -14866,8 +14866,6 @@ typedef struct gsf__mini_run {
     float *share;                             // (batch, half height, half width, references): of each in the mean
     float *head, *common, *heads, *choices;   // common: head_frame's result; heads, choices: per reference
     gsf__mini_planes levels[GSF__MINI_LEVELS];
-    float *pyramid;                           // per frame the levels of gsf__mini_fill_frame: colour 3, coverage
-    float *fill;                              // (batch, height, width, 3): what it adds to the render
     float *weight;                            // (batch, height, width, candidates)
     float *out, *error;                       // (batch, height, width, 3), not clamped; its logarithm (batch, height, width)
     float *fault;                             // likewise, of the render
@@ -14897,17 +14895,6 @@ static void gsf__mini_lay_out_level(gsf__mini_run* r, int l, gsf__nn_arena* aren
     p->db = gsf__nn_share(arena, size);
 }
 
-// Floats of the levels of a frame's pyramid.
-static size_t gsf__mini_pyramid_size(int64_t height, int64_t width) {
-    size_t size = 0;
-    while (height > 1 || width > 1) {
-        height = gsf__ceil_div(height, 2);
-        width = gsf__ceil_div(width, 2);
-        size += 4 * (size_t)(height * width);
-    }
-    return size;
-}
-
 // Divides the memory of a pass; returns the floats needed.
 static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     const gsf__mini* net = r->net;
@@ -14926,8 +14913,6 @@ static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     r->out = gsf__nn_share(&arena, 3 * pixels);
     r->error = gsf__nn_share(&arena, pixels);
     r->fault = gsf__nn_share(&arena, pixels);
-    r->pyramid = gsf__nn_share(&arena, (size_t)r->batch * gsf__mini_pyramid_size(r->height, r->width));
-    r->fill = gsf__nn_share(&arena, 3 * pixels);
     for (int l = 0; l < GSF__MINI_LEVELS; l++) gsf__mini_lay_out_level(r, l, &arena);
     r->weight = gsf__nn_share(&arena, training * pixels * (size_t)gsf__mini_candidates(r));
     r->dframe = gsf__nn_share(&arena, training * input);
@@ -15168,65 +15153,6 @@ static gsf__mini_pixel gsf__mini_pixel_at(const gsf__mini_run* r, int64_t row, i
     return p;
 }
 
-// Adds to a colour what a pixel's four neighbours in a level of the pyramid show, by their distance.
-static void gsf__mini_add_level(const float* level, int64_t h, int64_t w, int64_t y, int64_t x, float part, float* color) {
-    const int64_t ys[2] = {y / 2, gsf__least(y % 2 ? y / 2 + 1 : y > 0 ? y / 2 - 1 : 0, h - 1)};
-    const int64_t xs[2] = {x / 2, gsf__least(x % 2 ? x / 2 + 1 : x > 0 ? x / 2 - 1 : 0, w - 1)};
-    for (int i = 0; i < 4; i++) {
-        const float by = part * (i / 2 ? 0.25f : 0.75f) * (i % 2 ? 0.25f : 0.75f);
-        const float* from = level + 4 * (ys[i / 2] * w + xs[i % 2]);
-        for (int c = 0; c < 3; c++) color[c] += by * from[c];
-    }
-}
-
-/* Where no splats are, the render is black. What shows there instead is the colour of what is around it: averages of more and
-   more pixels, weighted by opacity, until one is covered. Colours are premultiplied, as those of the render are. */
-static void gsf__mini_fill_frame(void* arg, size_t frame, int32_t worker) {
-    const gsf__mini_run* r = (const gsf__mini_run*)arg;
-    const int64_t pitch = 4 * GSF__MINI_FRAME + 2 * r->net->features, b = (int64_t)frame;
-    int64_t h = r->height / 2, w = r->width / 2, heights[32], widths[32], at[32], count = 1;
-    float* pyramid = r->pyramid + frame * gsf__mini_pyramid_size(r->height, r->width);
-    const float* render = r->frame + b * h * w * pitch;
-    (void)worker;
-    heights[0] = h, widths[0] = w, at[0] = 0;
-    memset(pyramid, 0, (size_t)(4 * h * w) * sizeof *pyramid);
-    for (int64_t i = 0; i < 4 * h * w; i++) {
-        const float *from = render + i / 4 * pitch + i % 4 * GSF__MINI_FRAME, alpha = from[3];
-        float* to = pyramid + i / 4 * 4;
-        for (int c = 0; c < 3; c++) to[c] += from[c] + 0.5f < alpha ? from[c] + 0.5f : alpha; // no more than white
-        to[3] += alpha;
-    }
-    for (;; count++) {
-        float* level = pyramid + at[count - 1];
-        h = heights[count - 1], w = widths[count - 1];
-        for (int64_t i = 0; i < h * w; i++) { // more than covered is as good as covered
-            const float by = level[4 * i + 3] > 1.0f ? 1.0f / level[4 * i + 3] : 1.0f;
-            for (int k = 0; k < 4; k++) level[4 * i + k] *= by;
-        }
-        if (h == 1 && w == 1) break;
-        heights[count] = gsf__ceil_div(h, 2), widths[count] = gsf__ceil_div(w, 2), at[count] = at[count - 1] + 4 * h * w;
-        float* next = pyramid + at[count];
-        memset(next, 0, (size_t)(4 * heights[count] * widths[count]) * sizeof *next);
-        for (int64_t i = 0; i < h * w; i++)
-            for (int k = 0; k < 4; k++) next[4 * (i / w / 2 * widths[count] + i % w / 2) + k] += level[4 * i + k];
-    }
-    float* top = pyramid + at[count - 1];
-    for (int k = 0; k < 3; k++) top[k] = top[3] > 0.0f ? top[k] / top[3] : 0.0f;
-    for (int64_t l = count - 2; l >= 0; l--) {
-        float* level = pyramid + at[l];
-        for (int64_t i = 0; i < heights[l] * widths[l]; i++)
-            gsf__mini_add_level(pyramid + at[l + 1], heights[l + 1], widths[l + 1], i / widths[l], i % widths[l],
-                                1.0f - level[4 * i + 3], level + 4 * i);
-    }
-    for (int64_t y = 0; y < r->height; y++)
-        for (int64_t x = 0; x < r->width; x++) {
-            const float alpha = render[(y / 2 * widths[0] + x / 2) * pitch + (2 * (y % 2) + x % 2) * GSF__MINI_FRAME + 3];
-            float* fill = r->fill + 3 * ((b * r->height + y) * r->width + x);
-            memset(fill, 0, 3 * sizeof *fill);
-            gsf__mini_add_level(pyramid, heights[0], widths[0], y, x, 1.0f - alpha, fill);
-        }
-}
-
 static const float gsf__mini_free = 0.5f;   // factor of the free colour
 static const float gsf__mini_least = -6.0f; // of an error's logarithm
 
@@ -15259,9 +15185,8 @@ static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
             to[2] = shown[12] > 0.0f ? choices[2] : -1e30f;
         }
         kernels->softmax(logits, n, 1.0f, weight);
-        const float gate = gsf__mini_gate(p.head[6]), *fill = r->fill + 3 * p.fine;
-        for (int c = 0; c < 3; c++)
-            out[c] = p.frame[c] + 0.5f + gate * weight[1] * (fill[c] + gsf__mini_free * p.head[2 + c]);
+        const float gate = gsf__mini_gate(p.head[6]), free = gate * weight[1] * gsf__mini_free;
+        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + free * p.head[2 + c];
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
                 const float by = gate * weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
@@ -15289,7 +15214,6 @@ GSF__SHARED gsf_result gsf__mini_forward(gsf__mini_run* r, const gsf__mini_input
     gsf__parallel_for(r->ctx, rows, gsf__mini_join_row, r);
     GSF__TRY(gsf__mini_run_levels(r));
     GSF__TRY(gsf__mini_run_heads(r));
-    gsf__parallel_for(r->ctx, (size_t)r->batch, gsf__mini_fill_frame, r);
     gsf__parallel_for(r->ctx, (size_t)(r->batch * r->height), gsf__mini_blend_row, r);
     return GSF_OK;
 }
@@ -19637,7 +19561,7 @@ static gsf_result gsf__mini_convolve_grad(gsf__mini_run* r, gsf__nn_params* para
     d.accumulate = accumulate;
     d.dweight = gsf__nn_grad_of(params, layer->weight);
     d.dbias = gsf__nn_grad_of(params, layer->bias);
-    return gsf__nn_conv_grad(r->ctx, &d);
+    return dx || d.dweight || d.dbias ? gsf__nn_conv_grad(r->ctx, &d) : GSF_OK; // not all layers need be trained
 }
 
 static void gsf__mini_relu_grad(gsf__mini_run* r, const float* x, int64_t count, float* dx) { // dx: 0 where x is not positive
@@ -19722,7 +19646,7 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
         float *dhead = r->dhead + (p.head - r->head), mean = 0.0f;
         memset(slope, 0, sizeof slope);
         for (int c = 0; c < 3; c++) {
-            slope[1] += dout[c] * (r->fill[3 * p.fine + c] + gsf__mini_free * p.head[2 + c]);
+            slope[1] += dout[c] * gsf__mini_free * p.head[2 + c];
             dhead[2 + c] = gate * weight[1] * gsf__mini_free * dout[c];
         }
         for (int64_t k = 0; k < r->references; k++)

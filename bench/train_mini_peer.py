@@ -44,21 +44,6 @@ def tensors_of(path):
     return out
 
 
-def fill_of(frame):  # what fills the holes of a render: averages of more and more pixels, weighted by opacity
-    def finer(x, like):
-        return F.interpolate(x, scale_factor=2, mode="bilinear")[..., :like.shape[2], :like.shape[3]]
-    levels = [torch.minimum(frame[:, :4], frame[:, 3:4])]
-    while levels[-1].shape[2] > 1 or levels[-1].shape[3] > 1:
-        last = levels[-1]
-        x = 4 * F.avg_pool2d(F.pad(last, (0, last.shape[3] % 2, 0, last.shape[2] % 2)), 2)
-        levels.append(x / x[:, 3:4].clamp(min=1))
-    top = levels[-1]
-    color = torch.where(top[:, 3:4] > 0, top[:, :3] / top[:, 3:4], torch.zeros_like(top[:, :3]))
-    for x in levels[-2:0:-1]:
-        color = x[:, :3] + (1 - x[:, 3:4]) * finer(color, x)
-    return (1 - frame[:, 3:4]) * finer(color, frame)
-
-
 class Mini:
     def __init__(self, path, last):
         self.memory = torch.channels_last if last else torch.contiguous_format
@@ -112,7 +97,7 @@ class Mini:
         choices = self.shuffle(self.conv("head_blend", F.relu(hidden.flatten(0, 1)))).unflatten(0, (-1, count))
         choices = choices - 1e30 * (1 - torch.cat([seen, seen, valid], 2))
         weight = torch.softmax(torch.cat([head[:, :2], choices.flatten(1, 2)], 1), 1)
-        change = torch.cat([(fill_of(frame) + 0.5 * head[:, 2:5])[:, None], torch.stack([photo, residual, back], 2).flatten(1, 2)], 1)
+        change = torch.cat([0.5 * head[:, None, 2:5], torch.stack([photo, residual, back], 2).flatten(1, 2)], 1)
         gate = ((head[:, 6:7] - KEPT) / np.log(2.0)).clamp(0, 1)
         out = frame[:, :3] + gate * (weight[:, 1:, None] * change).sum(1)
         return out, head[:, 5:6].clamp(-6, 0), head[:, 6:7].clamp(-6, 0)

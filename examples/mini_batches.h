@@ -44,11 +44,12 @@ static tone_curve draw_tone(const mini_batch* b, size_t sample) {
     static const int orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2}, {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
     tone_curve t;
     const double gamma = exp(0.7 * draw_of(b, sample, 10) - 0.35), gain = exp(0.4 * draw_of(b, sample, 11) - 0.25);
+    const int turned = draw_of(b, sample, 13) < 0.1; // a negative
     t.saturation = (float)(0.2 + draw_of(b, sample, 12));
     memcpy(t.order, orders[(int)(6.0 * draw_of(b, sample, 14))], sizeof t.order);
     for (int i = 0; i <= BATCH_TABLE; i++) {
         const double v = gain * pow((double)i / BATCH_TABLE, gamma);
-        t.table[i] = (float)(v < 1.0 ? v : 1.0);
+        t.table[i] = (float)(turned ? 1.0 - (v < 1.0 ? v : 1.0) : v < 1.0 ? v : 1.0);
     }
     return t;
 }
@@ -101,7 +102,7 @@ static void vary_references(const mini_batch* b, size_t sample, mini_sample s) {
     }
 }
 
-// A hole in the splats: a black rectangle without depth.
+// A hole in the splats: a rectangle of one colour without depth.
 static void cut_hole(const mini_batch* b, size_t sample, mini_sample s) {
     const int64_t crop = b->crop, pixels = crop * crop;
     const int64_t w = (int64_t)((double)crop * (0.08 + 0.4 * draw_of(b, sample, 41)));
@@ -111,7 +112,8 @@ static void cut_hole(const mini_batch* b, size_t sample, mini_sample s) {
     for (int64_t y = y0; y < y0 + h; y++)
         for (int64_t x = x0; x < x0 + w; x++) {
             float* f = s.frame + (y * crop + x) * GSF__MINI_FRAME;
-            memset(f, 0, GSF__MINI_FRAME * sizeof *f);
+            for (int c = 0; c < 3; c++) f[c] = (float)draw_of(b, sample, 45 + c);
+            f[3] = f[4] = 0.0f;
             for (int r = 0; r < DATA_REFERENCES; r++) {
                 float* p = s.shown + (r * pixels + y * crop + x) * GSF__MINI_REFERENCE;
                 hide_reference(p, 0, 1);

@@ -72,35 +72,6 @@ static double* level(const twin* t, int l, const double* x, int h, int w) {
     return y;
 }
 
-// What fills a frame (h, w, 4: colour times opacity, opacity) where it is not covered, a level at a time; returns it (h, w, 3).
-static double* fill_of(const double* frame, int h, int w) {
-    double* out = doubles(3 * h * w);
-    if (h == 1 && w == 1) {
-        for (int c = 0; c < 3; c++) out[c] = frame[3] > 0.0 ? frame[c] / frame[3] : 0.0;
-        return out;
-    }
-    const int lh = (h + 1) / 2, lw = (w + 1) / 2;
-    double* low = doubles(4 * lh * lw);
-    for (int i = 0; i < h * w; i++)
-        for (int k = 0; k < 4; k++) low[4 * (i / w / 2 * lw + i % w / 2) + k] += frame[4 * i + k];
-    for (int i = 0; i < lh * lw; i++)
-        for (int k = 0; k < 4; k++) low[4 * i + k] /= low[4 * i + 3] > 1.0 && k < 3 ? low[4 * i + 3] : 1.0;
-    for (int i = 0; i < lh * lw; i++) low[4 * i + 3] = fmin(low[4 * i + 3], 1.0);
-    double* below = fill_of(low, lh, lw);
-    for (int i = 0; i < h * w; i++) {
-        const double y = (i / w + 0.5) / 2 - 0.5, x = (i % w + 0.5) / 2 - 0.5;
-        for (int k = 0; k < 4; k++) {
-            const int v = (int)floor(y) + k / 2, u = (int)floor(x) + k % 2;
-            const double part = (1.0 - fabs(y - v)) * (1.0 - fabs(x - u));
-            const int at = (v < 0 ? 0 : v < lh ? v : lh - 1) * lw + (u < 0 ? 0 : u < lw ? u : lw - 1);
-            for (int c = 0; c < 3; c++) out[3 * i + c] += part * below[3 * at + c];
-        }
-        for (int c = 0; c < 3; c++) out[3 * i + c] = frame[4 * i + c] + (1.0 - frame[4 * i + 3]) * out[3 * i + c];
-    }
-    free(low), free(below);
-    return out;
-}
-
 // out (height, width, 3), error (height, width, 2: of the result, of the render) of one frame
 static void run_twin(const twin* t, const gsf__mini_input* in, double* out, double* error) {
     enum { H = HEIGHT / 2, W = WIDTH / 2, COARSE = H * W };
@@ -165,9 +136,6 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
         relu(heads, COARSE * s);
         convolve(t, &t->net->head_blend, heads, H, W, 0, 0, choices + k * COARSE * 12);
     }
-    double* covered = doubles(4 * PIXELS);
-    for (int i = 0; i < 4 * PIXELS; i++) covered[i] = (double)fminf(in->frame[i / 4 * 5 + i % 4], in->frame[i / 4 * 5 + 3]);
-    double* fill = fill_of(covered, HEIGHT, WIDTH); // over the render
     for (int i = 0; i < PIXELS; i++) {
         const int x = i % WIDTH, row = i / WIDTH, at = (row / 2 * W + x / 2) * 4 + row % 2 * 2 + x % 2;
         double weight[CANDIDATES], sum = 0.0, *h = head + at * 7;
@@ -179,7 +147,7 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
         }
         const double part = (h[6] - log(0.012)) / log(2.0), gate = part > 1.0 ? 1.0 : part > 0.0 ? part : 0.0;
         for (int c = 0; c < 3; c++) {
-            double value = weight[1] / sum * (fill[3 * i + c] - covered[4 * i + c] + 0.5 * h[2 + c]);
+            double value = weight[1] / sum * 0.5 * h[2 + c];
             for (int k = 2; k < CANDIDATES; k++) {
                 const double* o = shown + ((k - 2) / 3 * COARSE * 4 + at) * 14;
                 const int kind = (k - 2) % 3;
@@ -190,7 +158,7 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
         for (int k = 0; k < 2; k++) error[2 * i + k] = h[5 + k] > 0.0 ? 0.0 : h[5 + k] > -6.0 ? h[5 + k] : -6.0;
     }
     free(frame), free(features), free(head), free(choices), free(shown), free(common), free(attention), free(first);
-    free(heads), free(y), free(covered), free(fill);
+    free(heads), free(y);
 }
 
 // ---- inputs ----------------------------------------------------------------------
