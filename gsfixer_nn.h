@@ -19561,7 +19561,7 @@ static gsf_result gsf__mini_convolve_grad(gsf__mini_run* r, gsf__nn_params* para
     d.accumulate = accumulate;
     d.dweight = gsf__nn_grad_of(params, layer->weight);
     d.dbias = gsf__nn_grad_of(params, layer->bias);
-    return dx || d.dweight || d.dbias ? gsf__nn_conv_grad(r->ctx, &d) : GSF_OK; // not all layers need be trained
+    return gsf__nn_conv_grad(r->ctx, &d);
 }
 
 static void gsf__mini_relu_grad(gsf__mini_run* r, const float* x, int64_t count, float* dx) { // dx: 0 where x is not positive

@@ -4,14 +4,13 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
-           [--pixels 216] [--fit 599] [--fault]
+           [--pixels 216] [--fit 599]
 
    DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
    the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume
    continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs
    with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
-   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. --fault: trains nothing but
-   the expected error of the render, that is, which renders are left as they are. */
+   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L
 #endif
@@ -28,7 +27,7 @@ typedef struct seeds { uint64_t first, last; } seeds;
 typedef struct options {
     const char *out, *data, *init;
     seeds scenes, check;
-    int steps, batch, crop, save_every, threads, resume, make_only, fault, pixels, fit;
+    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit;
     uint64_t seed;
     double rate;
 } options;
@@ -92,21 +91,6 @@ static gsf_result open_data(training* t) {
 
 // ---- training --------------------------------------------------------------------
 
-static int is_head(const char* name) { return strncmp(name, "head.", 5) == 0; }
-
-// With --fault: no gradient for the other outputs of the head.
-static void keep_outputs(training* t) {
-    const gsf_nn_weights* w = &t->net.weights;
-    for (size_t i = 0; i < w->tensor_count; i++) {
-        const int64_t from = t->params.at[i], rows = from < 0 ? 0 : w->tensors[i].shape[0];
-        for (int64_t row = 0; row < rows; row++) {
-            const int64_t size = w->tensors[i].count / rows;
-            if (row % GSF__MINI_HEAD != GSF__MINI_HEAD - 1)
-                memset(t->params.grad + from + row * size, 0, (size_t)size * sizeof(float));
-        }
-    }
-}
-
 // A new network, or that of --init; its weights and the optimiser's state are those of OUT.state if the run continues.
 static gsf_result open_network(training* t) {
     char first[2048], state[2048];
@@ -122,7 +106,7 @@ static gsf_result open_network(training* t) {
     snprintf(state, sizeof state, "%s.state", t->o.out);
     gsf_result result = t->o.init ? GSF_OK : gsf__mini_make(&t->ctx, &sizes, t->o.seed, first);
     if (result == GSF_OK) result = gsf__mini_open(&t->ctx, t->o.init ? t->o.init : first, NULL, 0, &t->net);
-    if (result == GSF_OK) result = gsf__nn_make_params(&t->ctx, &t->net.weights, t->o.fault ? is_head : NULL, 1, &t->params);
+    if (result == GSF_OK) result = gsf__nn_make_params(&t->ctx, &t->net.weights, NULL, 1, &t->params);
     if (result == GSF_OK && t->o.resume) result = gsf__nn_load_params(&t->ctx, &t->params, state);
     if (!t->o.init) remove(first);
     return result;
@@ -166,7 +150,6 @@ static gsf_result save_network(training* t) {
     for (int64_t i = 0; result == GSF_OK && i < t->params.count; i++) values[i] = gsf__float_to_bf16(t->params.average[i]);
     for (size_t i = 0; result == GSF_OK && i < w->tensor_count; i++) {
         all[i] = w->tensors[i];
-        if (t->params.at[i] < 0) continue; // as it was
         all[i].data = values + t->params.at[i];
         all[i].dtype = GSF_NN_BF16;
     }
@@ -184,7 +167,7 @@ static gsf_result train(training* t) {
     memset(&sum, 0, sizeof sum);
     adam.lr = t->o.rate;
     adam.beta2 = 0.99;
-    adam.weight_decay = t->o.fault ? 0.0 : 1e-4;
+    adam.weight_decay = 1e-4;
     adam.max_norm = 1.0;
     adam.warmup = t->o.steps < 200 ? t->o.steps / 2 : 100;
     adam.steps = t->o.steps;
@@ -198,7 +181,6 @@ static gsf_result train(training* t) {
         result = gsf__mini_forward(&t->run, t->inputs);
         if (result == GSF_OK) result = gsf__mini_measure_loss(&t->run, t->truth, &loss);
         if (result == GSF_OK) result = gsf__mini_backward(&t->run, &t->params);
-        if (t->o.fault) keep_outputs(t);
         adam.average = step / (step + 30.0) < 0.998 ? step / (step + 30.0) : 0.998; // short memory at first
         if (result == GSF_OK) result = gsf__nn_step_adam(&t->ctx, &t->params, &adam, &norm);
         if (result != GSF_OK) break;
@@ -313,7 +295,7 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
                 "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--fault]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -331,7 +313,6 @@ static int parse_options(int argc, char** argv, options* o) {
         if (strcmp(name, "--quick") == 0) o->steps = 4000;
         else if (strcmp(name, "--resume") == 0) o->resume = 1;
         else if (strcmp(name, "--make-only") == 0) o->make_only = 1;
-        else if (strcmp(name, "--fault") == 0) o->fault = 1;
         else if (name[0] != '-') {
             if (o->out) return 0;
             o->out = name;
@@ -365,7 +346,7 @@ static int parse_options(int argc, char** argv, options* o) {
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 0, 216, 599, 1, 1e-3};
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;
