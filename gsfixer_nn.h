@@ -14745,14 +14745,16 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
        the render; the render plus a free colour; per reference the photo carried through the photo's own depth, the render
        plus the reference's carried residual, and the photo at the point that the frame's depth shows.
    The output is their mean by a softmax of weights, so that the colours are those of photos, and the network has to find
-   only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made.
+   only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made,
+   and the error of the render. Where the latter is below that of renders of 35 dB the render stays as it is (gsf__mini_gate):
+   weights of a softmax are never 0, and small changes everywhere would spoil what is good already.
 
        planes of each reference -> unshuffle 2 -> 1x1 -> 3x3 -> features --+--> mean by softmax, maximum --+
                                                                             |                              v
        planes of the frame ------> unshuffle 2 -------------------------------------------------------> 3x3 -> U-Net
                                                                             |                              |
        weights of a reference's candidates <--- 1x1 <--- 3x3 <--------------+------------------------------+
-       weights of the others, free colour, log error <--- 1x1 <--------------------------------------------+
+       the others', free colour, logs of both errors <--- 1x1 <--------------------------------------------+
 
    References share all weights, so any number of them is allowed, in any order. Sizes are read from the tensors. All layers
    are convolutions of gsf__nn_convolve; the first level of the U-Net is at half the frame's size, each other at half the one
@@ -14761,7 +14763,7 @@ enum {
     GSF__MINI_LEVELS = 4,
     GSF__MINI_BLOCKS = 2,                       // residual blocks of a level on the way down, at most
     GSF__MINI_FRAME = 5, GSF__MINI_REFERENCE = 14, // planes, see gsf__mini_input
-    GSF__MINI_HEAD = 6, GSF__MINI_CHOICES = 3,  // outputs per pixel; weights per pixel and reference
+    GSF__MINI_HEAD = 7, GSF__MINI_CHOICES = 3,  // outputs per pixel; weights per pixel and reference
     GSF__MINI_MULTIPLE = 16,                    // of a frame's sides, inside the network
     GSF__MINI_MOST = 16,                        // references of a frame
     GSF__MINI_CHANNELS = 512,                   // of a layer
@@ -14901,7 +14903,8 @@ typedef struct gsf__mini_run {
     gsf__mini_planes levels[GSF__MINI_LEVELS];
     float *weight;                            // (batch, height, width, candidates)
     float *out, *error;                       // (batch, height, width, 3), not clamped; its logarithm (batch, height, width)
-    float *dframe, *dfeatures, *dhidden, *dhead, *dcommon, *dheads, *dchoices, *dout, *derror; // training: gradients
+    float *fault;                             // likewise, of the render
+    float *dframe, *dfeatures, *dhidden, *dhead, *dcommon, *dheads, *dchoices, *dout, *derror, *dfault; // training: gradients
     double* dattention;                       // training: per row, of the attention's weights and bias
 } gsf__mini_run;
 
@@ -14944,6 +14947,7 @@ static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     r->choices = gsf__nn_share(&arena, each * 4 * GSF__MINI_CHOICES);
     r->out = gsf__nn_share(&arena, 3 * pixels);
     r->error = gsf__nn_share(&arena, pixels);
+    r->fault = gsf__nn_share(&arena, pixels);
     for (int l = 0; l < GSF__MINI_LEVELS; l++) gsf__mini_lay_out_level(r, l, &arena);
     r->weight = gsf__nn_share(&arena, training * pixels * (size_t)gsf__mini_candidates(r));
     r->dframe = gsf__nn_share(&arena, training * input);
@@ -14955,6 +14959,7 @@ static size_t gsf__mini_lay_out(gsf__mini_run* r, float* memory) {
     r->dchoices = gsf__nn_share(&arena, training * each * 4 * GSF__MINI_CHOICES);
     r->dout = gsf__nn_share(&arena, training * 3 * pixels);
     r->derror = gsf__nn_share(&arena, training * pixels);
+    r->dfault = gsf__nn_share(&arena, training * pixels);
     gsf__nn_share(&arena, arena.used % 2); // doubles follow
     r->dattention = (double*)(void*)gsf__nn_share(
         &arena, training * 2 * (size_t)(r->batch * r->height / 2) * (size_t)(net->features + 1));
@@ -15184,7 +15189,17 @@ static gsf__mini_pixel gsf__mini_pixel_at(const gsf__mini_run* r, int64_t row, i
 }
 
 static const float gsf__mini_free = 0.5f;   // factor of the free colour
-static const float gsf__mini_least = -6.0f; // of the error's logarithm
+static const float gsf__mini_least = -6.0f; // of an error's logarithm
+
+static float gsf__mini_log_error(float x) { return x > 0.0f ? 0.0f : x > gsf__mini_least ? x : gsf__mini_least; }
+
+// Part of the blend's change that is made, by the logarithm of the render's expected error: none up to an error of 0.012, all
+// from 0.024 on.
+static const float gsf__mini_kept = -4.4228486f, gsf__mini_gate_slope = 1.4426950f; // log 0.012, 1 / log 2
+static float gsf__mini_gate(float fault) {
+    const float part = (fault - gsf__mini_kept) * gsf__mini_gate_slope;
+    return part >= 1.0f ? 1.0f : part <= 0.0f ? 0.0f : part; // NaN stays
+}
 
 static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
     const gsf__mini_run* r = (const gsf__mini_run*)arg;
@@ -15205,19 +15220,20 @@ static void gsf__mini_blend_row(void* arg, size_t row, int32_t worker) {
             to[2] = shown[12] > 0.0f ? choices[2] : -1e30f;
         }
         kernels->softmax(logits, n, 1.0f, weight);
-        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + weight[1] * gsf__mini_free * p.head[2 + c];
+        const float gate = gsf__mini_gate(p.head[6]), free = gate * weight[1] * gsf__mini_free;
+        for (int c = 0; c < 3; c++) out[c] = p.frame[c] + 0.5f + free * p.head[2 + c];
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
-                const float by = weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
+                const float by = gate * weight[2 + GSF__MINI_CHOICES * k + i] * gsf__mini_factor[i];
                 const float* d = r->shown + p.shown + k * p.next_shown + gsf__mini_offset[i];
                 for (int c = 0; c < 3; c++) out[c] += by * d[c];
             }
-        const float error = p.head[5];
-        r->error[p.fine] = error > 0.0f ? 0.0f : error > gsf__mini_least ? error : gsf__mini_least;
+        r->error[p.fine] = gsf__mini_log_error(p.head[5]);
+        r->fault[p.fine] = gsf__mini_log_error(p.head[6]);
     }
 }
 
-// Computes r->out and r->error of a batch.
+// Computes r->out, r->error and r->fault of a batch.
 GSF__SHARED gsf_result gsf__mini_forward(gsf__mini_run* r, const gsf__mini_input* inputs) {
     const gsf__mini* net = r->net;
     const int64_t frames = r->batch * r->references, coarse = r->levels[0].height * r->levels[0].width;
@@ -18903,6 +18919,17 @@ static void gsf__conv_grad_weight(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
+// Adds the bands, which are (taps, in, out), in their order to dweight, which is (out, in, taps).
+static void gsf__conv_grad_add(const gsf__conv_grad_job* g, double* sums, float* dweight) {
+    const int64_t in = g->layer.in, out = g->layer.out, taps = gsf__conv_taps(&g->layer), size = taps * in * out;
+    memset(sums, 0, (size_t)size * sizeof *sums);
+    for (int64_t band = 0; band < g->bands; band++)
+        for (int64_t i = 0; i < size; i++) sums[i] += (double)g->sums[band * size + i];
+    for (int64_t o = 0; o < out; o++)
+        for (int64_t i = 0; i < in; i++)
+            for (int64_t t = 0; t < taps; t++) dweight[(o * in + i) * taps + t] += (float)sums[(t * in + i) * out + o];
+}
+
 // Gradients of gsf__nn_convolve.
 GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_grad_desc* d) {
     gsf__nn_conv_desc forward = *d->forward;
@@ -18922,19 +18949,17 @@ GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_gr
         const int64_t most = gsf__least(GSF__CONV_GRAD_BANDS, gsf__least(GSF__CONV_GRAD_SUMS / size, rows));
         g.band_rows = gsf__ceil_div(rows, most > 1 ? most : 1);
         g.bands = gsf__ceil_div(rows, g.band_rows);
+        double* sums = (double*)gsf_alloc(ctx, (size_t)size, sizeof *sums);
         g.sums = (float*)gsf_alloc(ctx, (size_t)g.bands, (size_t)size * sizeof(float));
-        if (!g.sums) return GSF_ERROR_OUT_OF_MEMORY;
         const int64_t pieces = gsf__ceil_div(g.layer.in, GSF__CONV_GRAD_CHANNELS);
-        gsf__parallel_for(ctx, (size_t)(g.bands * taps * pieces), gsf__conv_grad_weight, &g);
-        for (int64_t o = 0; o < g.layer.out; o++)
-            for (int64_t i = 0; i < g.layer.in; i++)
-                for (int64_t t = 0; t < taps; t++) {
-                    double sum = 0.0;
-                    for (int64_t band = 0; band < g.bands; band++)
-                        sum += (double)g.sums[((band * taps + t) * g.layer.in + i) * g.layer.out + o];
-                    d->dweight[(o * g.layer.in + i) * taps + t] += (float)sum;
-                }
+        if (g.sums && sums) {
+            gsf__parallel_for(ctx, (size_t)(g.bands * taps * pieces), gsf__conv_grad_weight, &g);
+            gsf__conv_grad_add(&g, sums, d->dweight);
+        }
+        const int failed = !g.sums || !sums;
         gsf_free(ctx, g.sums);
+        gsf_free(ctx, sums);
+        if (failed) return GSF_ERROR_OUT_OF_MEMORY;
     }
     return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * g.width, g.layer.out, d->dbias) : GSF_OK;
 }
@@ -20045,7 +20070,10 @@ static gsf_result gsf__mini_levels_grad(gsf__mini_run* r, gsf__nn_params* params
     return GSF_OK;
 }
 
-// From dout and derror, the gradients of out and error, to those of head and choices.
+// The gradient of what is clamped to r->error or r->fault.
+static float gsf__mini_log_grad(float x, float d) { return x > gsf__mini_least && x <= 0.0f ? d : 0.0f; }
+
+// From dout, derror and dfault, the gradients of out, error and fault, to those of head and choices.
 static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
     const gsf__mini_run* r = (const gsf__mini_run*)arg;
     const int64_t n = gsf__mini_candidates(r);
@@ -20054,11 +20082,12 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
     for (int64_t x = 0; x < r->width; x++) {
         const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
         const float *dout = r->dout + 3 * p.fine, *weight = r->weight + p.fine * n;
+        const float gate = gsf__mini_gate(p.head[6]);
         float *dhead = r->dhead + (p.head - r->head), mean = 0.0f;
         memset(slope, 0, sizeof slope);
         for (int c = 0; c < 3; c++) {
             slope[1] += dout[c] * gsf__mini_free * p.head[2 + c];
-            dhead[2 + c] = weight[1] * gsf__mini_free * dout[c];
+            dhead[2 + c] = gate * weight[1] * gsf__mini_free * dout[c];
         }
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) {
@@ -20066,13 +20095,15 @@ static void gsf__mini_blend_grad_row(void* arg, size_t row, int32_t worker) {
                 slope[2 + GSF__MINI_CHOICES * k + i] = gsf__mini_factor[i] * (dout[0] * d[0] + dout[1] * d[1] + dout[2] * d[2]);
             }
         for (int64_t k = 0; k < n; k++) mean += weight[k] * slope[k];
-        dhead[0] = weight[0] * (slope[0] - mean);
-        dhead[1] = weight[1] * (slope[1] - mean);
-        dhead[5] = p.head[5] > gsf__mini_least && p.head[5] <= 0.0f ? r->derror[p.fine] : 0.0f;
+        dhead[0] = gate * weight[0] * (slope[0] - mean);
+        dhead[1] = gate * weight[1] * (slope[1] - mean);
+        dhead[5] = gsf__mini_log_grad(p.head[5], r->derror[p.fine]);
+        dhead[6] = gsf__mini_log_grad(p.head[6], r->dfault[p.fine]);
+        if (gate > 0.0f && gate < 1.0f) dhead[6] += gsf__mini_gate_slope * mean;
         for (int64_t k = 0; k < r->references; k++)
             for (int i = 0; i < GSF__MINI_CHOICES; i++) { // a candidate that there is not has no weight
                 const int64_t at = 2 + GSF__MINI_CHOICES * k + i;
-                r->dchoices[p.choices + k * p.next_choices + i] = weight[at] * (slope[at] - mean);
+                r->dchoices[p.choices + k * p.next_choices + i] = gate * weight[at] * (slope[at] - mean);
             }
     }
 }
@@ -20155,8 +20186,8 @@ static gsf_result gsf__mini_references_grad(gsf__mini_run* r, gsf__nn_params* pa
     return gsf__mini_convolve_grad(r, params, &net->first, r->shown, frames, 0, 0, r->dhidden, 0, NULL);
 }
 
-// Adds the gradients of the weights to params->grad, after a forward pass of the same batch; r->dout and r->derror: those of
-// its results.
+// Adds the gradients of the weights to params->grad, after a forward pass of the same batch; r->dout, r->derror and r->dfault:
+// those of its results.
 GSF__SHARED gsf_result gsf__mini_backward(gsf__mini_run* r, gsf__nn_params* params) {
     gsf__parallel_for(r->ctx, (size_t)(r->batch * r->height), gsf__mini_blend_grad_row, r);
     GSF__TRY(gsf__mini_heads_grad(r, params));
@@ -20166,10 +20197,12 @@ GSF__SHARED gsf_result gsf__mini_backward(gsf__mini_run* r, gsf__nn_params* para
 
 /* The loss of a batch, mean over its frames: squared error relative to that of the render; Charbonnier's smoothed absolute
    error; absolute error of the differences between neighbours; and the negative log likelihood of the error's size under the
-   Laplace distribution that `error` describes, whose slope does not reach the colours. */
-typedef struct gsf__mini_loss { double total, relative, square, before, likelihood; } gsf__mini_loss; // before: the render's
+   Laplace distribution that `error` describes, and of the render's under that of `fault`, whose slopes do not reach the
+   colours. */
+typedef struct gsf__mini_loss { double total, relative, square, likelihood, before, fault; } gsf__mini_loss; // the render's
+                                                                                       // square and likelihood: before, fault
 
-enum { GSF__MINI_LOSS_TERMS = 5 }; // sums: charbonnier, square, the render's square, likelihood, neighbours
+enum { GSF__MINI_LOSS_TERMS = 6 }; // sums: charbonnier, square, the render's square, likelihood, neighbours, its likelihood
 
 typedef struct gsf__mini_loss_job {
     const gsf__mini_run* r;
@@ -20196,7 +20229,7 @@ static void gsf__mini_loss_row(void* arg, size_t row, int32_t worker) {
     memset(s, 0, GSF__MINI_LOSS_TERMS * sizeof *s);
     for (int64_t x = 0; x < w; x++) {
         const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
-        double size = 0.0;
+        double size = 0.0, before = 0.0;
         for (int64_t c = 0; c < 3; c++) {
             const int64_t at = 3 * p.fine + c;
             const double e = gsf__mini_miss(job, at), render = (double)p.frame[c] + 0.5 - (double)job->truth[at];
@@ -20204,10 +20237,12 @@ static void gsf__mini_loss_row(void* arg, size_t row, int32_t worker) {
             s[1] += e * e;
             s[2] += render * render;
             size += fabs(e) / 3.0;
+            before += fabs(render) / 3.0;
             if (x + 1 < w) s[4] += fabs(gsf__mini_miss(job, at + 3) - e);
             if (y + 1 < r->height) s[4] += fabs(gsf__mini_miss(job, at + 3 * w) - e);
         }
         s[3] += size * exp(-(double)r->error[p.fine]) + (double)r->error[p.fine];
+        s[5] += before * exp(-(double)r->fault[p.fine]) + (double)r->fault[p.fine];
     }
 }
 
@@ -20218,11 +20253,13 @@ static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
     const double part = 1.0 / (3.0 * job->pixels), *weight = gsf__mini_loss_weight;
     (void)worker;
     for (int64_t x = 0; x < w; x++) {
-        const int64_t pixel = (int64_t)row * w + x;
-        double size = 0.0;
+        const gsf__mini_pixel p = gsf__mini_pixel_at(r, (int64_t)row, x);
+        const int64_t pixel = p.fine;
+        double size = 0.0, before = 0.0;
         for (int64_t at = 3 * pixel; at < 3 * pixel + 3; at++) {
             const double e = gsf__mini_miss(job, at);
             double neighbours = 0.0;
+            before += fabs((double)p.frame[at - 3 * pixel] + 0.5 - (double)job->truth[at]) / 3.0;
             if (x > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3));
             if (x + 1 < w) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at + 3));
             if (y > 0) neighbours += gsf__mini_sign(e - gsf__mini_miss(job, at - 3 * w));
@@ -20232,12 +20269,14 @@ static void gsf__mini_loss_grad_row(void* arg, size_t row, int32_t worker) {
                                           2.0 * job->relative[b] * e));
         }
         r->derror[pixel] = (float)(weight[2] / job->pixels * (1.0 - size * exp(-(double)r->error[pixel])));
+        r->dfault[pixel] = (float)(weight[2] / job->pixels * (1.0 - before * exp(-(double)r->fault[pixel])));
     }
 }
 
-static const double gsf__mini_loss_floor = 1e-2; // added to the render's squared error
+static const double gsf__mini_loss_floor = 2e-3; // added to the render's squared error
 
-// The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout and r->derror.
+// The loss of a forward pass, whose frames have sides that are multiples of GSF__MINI_MULTIPLE; sets r->dout,
+// r->derror and r->dfault.
 GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* truth, gsf__mini_loss* loss) {
     const int64_t rows = r->batch * r->height;
     double relative[64], batch = (double)r->batch, pixels = (double)(r->height * r->width), values = 3.0 * pixels * batch;
@@ -20257,9 +20296,10 @@ GSF__SHARED gsf_result gsf__mini_measure_loss(gsf__mini_run* r, const float* tru
         loss->square += s[1] / values;
         loss->before += s[2] / values;
         loss->likelihood += s[3] / (pixels * batch);
+        loss->fault += s[5] / (pixels * batch);
         loss->total += (gsf__mini_loss_weight[0] * s[0] + gsf__mini_loss_weight[1] * s[4]) / values;
     }
-    loss->total += loss->relative + gsf__mini_loss_weight[2] * loss->likelihood;
+    loss->total += loss->relative + gsf__mini_loss_weight[2] * (loss->likelihood + loss->fault);
     gsf__parallel_for(r->ctx, (size_t)rows, gsf__mini_loss_grad_row, &job);
     gsf_free(r->ctx, job.sums);
     return GSF_OK;
@@ -20291,7 +20331,7 @@ static gsf_result gsf__mini_make_tensor(void* user, const char* name, int32_t ra
                                              ? 0.0f
                                              : (float)(normal * sqrt(1.0 / (3.0 * (double)inputs)));
         if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 0) m->values[m->used + (size_t)i] = 6.0f;
-        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD == 5) m->values[m->used + (size_t)i] = -3.0f;
+        if (strcmp(name, "head.bias") == 0 && i % GSF__MINI_HEAD > 4) m->values[m->used + (size_t)i] = -3.0f;
         if (strcmp(name, "reference.second.bias") == 0) m->values[m->used + (size_t)i] = 0.0f;
     }
     if (m->tensors) {

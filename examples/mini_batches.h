@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: MIT
 /* Sample b of step t depends on the seed, t and b only. Augmentations act on all planes of a crop alike: mirrored, transposed,
    channels of colours in another order, less or more saturated, another gamma and exposure. Some hide evidence: references that
-   show nothing, or nothing by one of the two ways; holes in the render. Others make the input better than splats are: renders
-   that are partly the truth, so that the network sees pixels which it must leave alone. */
+   show nothing, or nothing by one of the two ways; holes in the render. Others make the input better than splats of few photos
+   are: a fifth of the renders is partly the truth, so that the network sees pixels which it must leave alone. */
 #ifndef MINI_BATCHES_H
 #define MINI_BATCHES_H
 
@@ -122,6 +122,14 @@ static void cut_hole(const mini_batch* b, size_t sample, mini_sample s) {
         }
 }
 
+// Splats with a part of their faults only: less of them in the render, and in the residuals at the photos.
+static void better_pixel(float part, mini_sample s, int64_t at, int64_t pixels) {
+    float* render = s.frame + at * GSF__MINI_FRAME;
+    for (int c = 0; c < 3; c++) render[c] = s.truth[3 * at + c] + part * (render[c] - s.truth[3 * at + c]);
+    for (int r = 0; r < DATA_REFERENCES; r++)
+        for (int c = 3; c < 6; c++) s.shown[(r * pixels + at) * GSF__MINI_REFERENCE + c] *= part;
+}
+
 static void make_sample(void* arg, size_t sample, int32_t worker) {
     const mini_batch* b = (const mini_batch*)arg;
     const mini_sample s = b->samples[sample];
@@ -132,7 +140,7 @@ static void make_sample(void* arg, size_t sample, int32_t worker) {
     const int64_t x0 = (int64_t)((double)(width - crop + 1) * draw_of(b, sample, 3));
     const int mirror = draw_of(b, sample, 4) < 0.5, flip = draw_of(b, sample, 5) < 0.5, swap = draw_of(b, sample, 6) < 0.5;
     const tone_curve curve = draw_tone(b, sample);
-    const float truth = draw_of(b, sample, 7) < 0.08 ? (float)(0.5 + 0.4 * draw_of(b, sample, 8)) : 0.0f;
+    const float fault = draw_of(b, sample, 7) < 0.2 ? (float)exp(-3.5 * draw_of(b, sample, 8)) : 1.0f; // down to -30 dB
     (void)worker;
     for (int64_t y = 0; y < crop; y++)
         for (int64_t x = 0; x < crop; x++) {
@@ -140,8 +148,7 @@ static void make_sample(void* arg, size_t sample, int32_t worker) {
             const int64_t row = frame * height + y0 + (flip ? crop - 1 - v : v), column = x0 + (mirror ? crop - 1 - u : u);
             read_pixel((const uint8_t*)t->data + (row * width + column) * DATA_PIXEL, s, at, pixels);
             tone_pixel(&curve, s, at, pixels);
-            float* render = s.frame + at * GSF__MINI_FRAME;
-            for (int c = 0; c < 3; c++) render[c] += truth * (s.truth[3 * at + c] - render[c]);
+            better_pixel(fault, s, at, pixels);
         }
     vary_references(b, sample, s);
     if (draw_of(b, sample, 40) < 0.25) cut_hole(b, sample, s);

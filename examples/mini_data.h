@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 /* A scene is a made scene (make_scene.c), splats fitted to a few of its photos by the repair loop, and frames of the loop's own
    path as a restorer gets them, just before the loop's rounds, with the photos carried into them and the ray-traced truth.
+   Frames from behind a wall, where the loop's path may go, are left out: no restorer could know that the wall is there.
    The file of a scene has one tensor, "frames": u8 (frames, height, width, 50), per pixel
 
        render 3 | alpha | nearness | truth 3 |
@@ -19,7 +20,7 @@ enum { DATA_VIEWS = 22, DATA_WINDOWS = 4, DATA_WINDOW = 9 };
 
 typedef struct data_desc { // of all scenes
     const char* dir;
-    int pixels;      // the longer side; the other is two thirds of it
+    int pixels;      // the longer side, at least, and at most 1.4 times as much; the other is two thirds of it
     int fit;         // step of the last round
 } data_desc;
 
@@ -35,9 +36,12 @@ static float data_float(uint8_t x, int is_signed) { return is_signed ? ((float)x
 
 typedef struct data_probe { // a restorer that restores nothing and writes down what it gets
     world* s;
-    float exposure;
-    int rounds, help;      // rounds begun; 1: returns half of the truth, so that later rounds see repaired splats
-    size_t count, room;    // frames; of bytes
+    const gsf_camera* cameras; // of the photos
+    float exposures[DATA_VIEWS]; // of the photos, in stops
+    size_t photos;
+    int rounds;                // begun
+    float help;                // part of the truth in what it returns, so that later rounds see repaired splats
+    size_t count, room;        // frames; of bytes
     int64_t width, height;
     uint8_t* bytes;
 } data_probe;
@@ -58,20 +62,45 @@ static gsf_result probe_begin(void* user, gsf_context* ctx, const gsf_reference*
 
 static void probe_end(void* user, gsf_context* ctx) { (void)user, (void)ctx; }
 
+// That of the photos around a camera, as carried photos have it (>>carry): exposure changes gradually along a capture.
+static float probe_exposure(const data_probe* p, const gsf_camera* camera) {
+    double at[3], center[3], sum = 0.0, total = 0.0;
+    gsf_get_camera_center(camera, at);
+    for (size_t i = 0; i < p->photos; i++) {
+        gsf_get_camera_center(p->cameras + i, center);
+        double square = 1e-4;
+        for (int k = 0; k < 3; k++) square += (at[k] - center[k]) * (at[k] - center[k]);
+        sum += (double)p->exposures[i] / square;
+        total += 1.0 / square;
+    }
+    return exp2f((float)(sum / total));
+}
+
 // The truth at a camera; the sensor's noise is that of a photo that the scene does not have.
-static gsf_result probe_truth(gsf_context* ctx, const data_probe* p, const gsf_camera* camera, uint8_t* out, float* spare) {
-    const size_t pixels = (size_t)(camera->width * camera->height);
-    photo_job job = {p->s, *camera, 1000 + p->count, out, spare, spare + pixels, p->exposure};
+static gsf_result probe_truth(gsf_context* ctx, const data_probe* p, const gsf_camera* camera, uint8_t* out, float* depth,
+                              float* normal) {
+    photo_job job = {p->s, *camera, 1000 + p->count, out, depth, normal, probe_exposure(p, camera)};
     ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
     return gsf_is_cancelled(ctx) ? GSF_ERROR_CANCELLED : GSF_OK;
+}
+
+// Adds up the scores of what a reference shows, and of those that the true surface hides.
+static void probe_hidden(const gsf_carried* c, const float* depth, double* hidden, double* all) {
+    for (int64_t i = 0; i < c->depth.width * c->depth.height; i++) {
+        const float score = ((const float*)c->score.data)[i], z = ((const float*)c->depth.data)[i];
+        *all += (double)score;
+        if (depth[i] > 0.0f && depth[i] < 0.7f * z) *hidden += (double)score;
+    }
 }
 
 static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore_window* w, int32_t frame, float* planes,
                               uint8_t* truth) {
     const gsf_image* depth = w->depth + frame;
     const int64_t pixels = depth->width * depth->height;
+    float* true_depth = planes + pixels * GSF__MINI_REFERENCE;
+    double hidden = 0.0, all = 0.0;
     uint8_t* out = p->bytes + p->count * (size_t)pixels * DATA_PIXEL;
-    gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, planes);
+    gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, true_depth, planes);
     gsf__mini_plane_frame(w->color + frame, w->alpha + frame, depth, planes);
     for (int64_t i = 0; i < pixels; i++) {
         for (int k = 0; k < GSF__MINI_FRAME; k++) out[i * DATA_PIXEL + k] = data_byte(planes[i * GSF__MINI_FRAME + k], 0);
@@ -83,13 +112,16 @@ static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore
         result = w->carry_fn(w->carry_user, ctx, frame, slot, &carried);
         if (result != GSF_OK) break;
         memset(planes, 0, (size_t)(pixels * GSF__MINI_REFERENCE) * sizeof(float));
-        if (carried.reference >= 0) gsf__mini_plane_reference(&carried, depth, planes);
+        if (carried.reference >= 0) {
+            gsf__mini_plane_reference(&carried, depth, planes);
+            probe_hidden(&carried, true_depth, &hidden, &all);
+        }
         for (int64_t i = 0; i < pixels; i++)
             for (int k = 0; k < GSF__MINI_REFERENCE; k++)
                 out[i * DATA_PIXEL + DATA_FRAME + slot * GSF__MINI_REFERENCE + k] =
                     data_byte(planes[i * GSF__MINI_REFERENCE + k], data_is_signed(k));
     }
-    p->count += result == GSF_OK;
+    p->count += result == GSF_OK && hidden <= 0.3 * all;
     return result;
 }
 
@@ -104,7 +136,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
         p->room = (size_t)(pixels * DATA_PIXEL) * 3 * DATA_WINDOWS * DATA_WINDOW;
         p->bytes = (uint8_t*)gsf_alloc(ctx, p->room, 1);
     }
-    float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * GSF__MINI_REFERENCE, sizeof(float));
+    float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * (GSF__MINI_REFERENCE + 1), sizeof(float));
     uint8_t* truth = (uint8_t*)gsf_alloc(ctx, (size_t)pixels, 3);
     gsf_result result = p->bytes && planes && truth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
@@ -112,9 +144,11 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
         const int taken = w->reference_index[i] < 0 && (i + w->clip + p->rounds) % 2 == 0;
         if (taken) result = probe_frame(ctx, p, w, i, planes, truth);
         for (int64_t k = 0; k < pixels; k++) {
-            confidence[k] = p->help && taken ? 0.5f : 0.0f;
-            for (int64_t c = 3 * k; c < 3 * k + 3; c++)
-                color[c] = ((const float*)w->color[i].data)[c] * 0.5f + (taken ? (float)truth[c] : 0.0f) / 510.0f;
+            confidence[k] = taken ? p->help : 0.0f;
+            for (int64_t c = 3 * k; c < 3 * k + 3; c++) {
+                const float render = ((const float*)w->color[i].data)[c];
+                color[c] = taken ? render + p->help * ((float)truth[c] / 255.0f - render) : render;
+            }
         }
     }
     gsf_free(ctx, planes);
@@ -126,11 +160,12 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
 static make_scene_options data_options(const data_desc* d, uint64_t seed) {
     make_scene_options o = make_scene_defaults;
     const int upright = gsf_draw_uniform(seed, 1, 0) < 0.3;
+    const int side = (int)(d->pixels * (1.0 + 0.4 * gsf_draw_uniform(seed, 1, 5)));
     o.seed = seed;
     o.layout = 1 + (int)(seed % (LAYOUTS - 1));
     o.views = DATA_VIEWS;
-    o.width = upright ? 2 * d->pixels / 3 : d->pixels;
-    o.height = upright ? d->pixels : 2 * d->pixels / 3;
+    o.width = upright ? 2 * side / 3 : side;
+    o.height = upright ? side : 2 * side / 3;
     o.points = 1500;
     o.arc = 60.0 + 140.0 * gsf_draw_uniform(seed, 1, 1);
     o.drift = gsf_draw_uniform(seed, 1, 2) < 0.4 ? 0.8 * gsf_draw_uniform(seed, 1, 3) : 0.0;
@@ -140,10 +175,12 @@ static make_scene_options data_options(const data_desc* d, uint64_t seed) {
 // Runs the loop with the probe until its last round is over.
 static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o,
                            data_probe* p) {
-    static const size_t views_of[6] = {3, 3, 4, 5, 6, 9};
+    static const size_t views_of[8] = {3, 3, 4, 3, 5, 6, 9, 12};
     const uint64_t seed = o->seed;
+    const double noise = 0.1 + 0.4 * gsf_draw_uniform(seed, 1, 6); // of poses, in pixels
     gsf_restorer restorer = {sizeof restorer, "probe", p, probe_query, probe_begin, probe_restore, probe_end, NULL};
     uint32_t train[DATA_VIEWS], test[DATA_VIEWS];
+    gsf_camera cameras[DATA_VIEWS];
     size_t count, held_out;
     gsf_scene scene;
     gsf_train_view* views = NULL;
@@ -153,17 +190,20 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
     memset(&start, 0, sizeof start);
     memset(&now, 0, sizeof now);
     gsf_result result = gsf_splat_load_scene(ctx, folder, NULL, &scene);
-    gsf_splat_split_views(scene.view_count, 8, views_of[seed % 6], train, &count, test, &held_out);
+    gsf_splat_split_views(scene.view_count, 8, views_of[seed % 8], train, &count, test, &held_out);
     for (size_t i = 0; i < count && result == GSF_OK; i++) { // as uncertain as poses from features are
         gsf_camera* camera = &scene.views[train[i]].camera;
-        camera->cx += 0.2 * gsf_draw_normal(seed, 2, 2 * i);
-        camera->cy += 0.2 * gsf_draw_normal(seed, 2, 2 * i + 1);
-        p->exposure += log2f(exposure_of(o, train[i])) / (float)count;
+        camera->cx += noise * gsf_draw_normal(seed, 2, 2 * i);
+        camera->cy += noise * gsf_draw_normal(seed, 2, 2 * i + 1);
+        cameras[i] = *camera;
+        p->exposures[i] = log2f(exposure_of(o, train[i]));
     }
-    p->exposure = exp2f(p->exposure);
+    p->cameras = cameras;
+    p->photos = count;
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
     gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_EXACT);
+    desc.trajectory = seed / 16 % 2 ? GSF_TRAJ_REFERENCE : GSF_TRAJ_SPREAD; // frames far from the photos, and near them
     desc.train.iterations = d->fit + 101;
     desc.train.seed = seed;
     desc.first_round = d->fit / 3;
@@ -193,7 +233,8 @@ static gsf_result make_data(gsf_context* ctx, const data_desc* d, uint64_t seed,
     if (!make_folder(d->dir, "") || !make_folder(d->dir, "/scenes") || make_scene(ctx, &o, folder) != 0)
         return gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot make the scene", folder);
     p.s = &s;
-    p.help = gsf_draw_uniform(seed, 1, 4) < 0.5;
+    const double help = gsf_draw_uniform(seed, 1, 4);
+    p.help = help < 0.5 ? 0.0f : help < 0.75 ? 0.5f : 1.0f;
     gsf_result result = start_world(ctx, &s, &o) ? GSF_OK : gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: no scene", folder);
     if (result == GSF_OK) result = data_run(ctx, d, folder, &o, &p);
     gsf_nn_tensor frames;

@@ -3,7 +3,7 @@
    (with Embree, which traces the rays faster: -DGSF_USE_EMBREE and -lembree3 or -lembree4)
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
-           [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
+           [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
            [--pixels 216] [--fit 599]
 
    DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
@@ -185,12 +185,13 @@ static gsf_result train(training* t) {
         if (result == GSF_OK) result = gsf__nn_step_adam(&t->ctx, &t->params, &adam, &norm);
         if (result != GSF_OK) break;
         sum.relative += loss.relative, sum.square += loss.square, sum.before += loss.before;
-        sum.likelihood += loss.likelihood;
+        sum.likelihood += loss.likelihood, sum.fault += loss.fault;
         counted++;
         if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
-            fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f\n",
+            fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f, %.3f\n",
                     (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
-                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted);
+                    decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted,
+                    sum.fault / counted);
             memset(&sum, 0, sizeof sum);
             counted = 0;
         }
@@ -204,52 +205,87 @@ static gsf_result train(training* t) {
 
 // ---- measuring -------------------------------------------------------------------
 
-// PSNR of whole frames before and after, mean over the frames of a scene.
-static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_tensor* frames, double* before, double* after) {
+typedef struct figures { double before, after; } figures; // decibels
+
+typedef struct checking {
+    gsf__mini_run run;
+    mini_sample sample; // a whole frame
+    int64_t width, height;
+} checking;
+
+// Mean squared errors of a frame before and after.
+static gsf_result measure_frame(checking* c, figures* squares) {
+    const mini_sample s = c->sample;
+    const gsf__mini_input input = {c->width, c->height, DATA_REFERENCES, s.frame, s.shown};
+    const gsf_result result = gsf__mini_forward(&c->run, &input);
+    *squares = (figures){0.0, 0.0};
+    for (int64_t y = 0; y < c->height && result == GSF_OK; y++)
+        for (int64_t x = 0; x < 3 * c->width; x++) {
+            const double truth = (double)s.truth[y * 3 * c->width + x];
+            const double a = (double)s.frame[(y * c->width + x / 3) * GSF__MINI_FRAME + x % 3] - truth;
+            const double b = (double)gsf__mini_clamp(c->run.out[y * 3 * c->run.width + x], 0.0f, 1.0f) - truth;
+            squares->before += a * a / (double)(3 * c->width * c->height);
+            squares->after += b * b / (double)(3 * c->width * c->height);
+        }
+    return result;
+}
+
+static void add_frame(figures* sum, figures squares, double part) {
+    sum->before += part * decibels(squares.before);
+    sum->after += part * decibels(squares.after);
+}
+
+// PSNR of whole frames before and after, mean over the frames of a scene; `good`: of the same frames with so small a part of
+// their faults that they are at GOOD_DECIBELS, which should stay as they are.
+enum { GOOD_DECIBELS = 40 };
+static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_tensor* frames, figures* all, figures* good) {
     const int64_t height = frames->shape[1], width = frames->shape[2], pixels = height * width;
     const size_t planes = GSF__MINI_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE;
+    const double share = 1.0 / (double)frames->shape[0];
     float* memory = (float*)gsf_alloc(&t->ctx, (size_t)pixels, (planes + 3) * sizeof(float));
-    gsf__mini_run run;
-    gsf_result result = gsf__mini_begin(&t->ctx, net, 1, DATA_REFERENCES, width, height, 0, &run);
+    checking c;
+    memset(&c, 0, sizeof c);
+    gsf_result result = gsf__mini_begin(&t->ctx, net, 1, DATA_REFERENCES, width, height, 0, &c.run);
     if (!memory) result = GSF_ERROR_OUT_OF_MEMORY;
-    const mini_sample s = {memory, memory + pixels * GSF__MINI_FRAME, memory + pixels * (int64_t)planes};
-    const gsf__mini_input input = {width, height, DATA_REFERENCES, s.frame, s.shown};
-    *before = *after = 0.0;
+    c.sample = (mini_sample){memory, memory + pixels * GSF__MINI_FRAME, memory + pixels * (int64_t)planes};
+    c.width = width;
+    c.height = height;
+    *all = *good = (figures){0.0, 0.0};
     for (int64_t f = 0; f < frames->shape[0] && result == GSF_OK; f++) {
-        double squares[2] = {0.0, 0.0};
         const uint8_t* from = (const uint8_t*)frames->data + f * pixels * DATA_PIXEL;
-        for (int64_t i = 0; i < pixels; i++) read_pixel(from + i * DATA_PIXEL, s, i, pixels);
-        result = gsf__mini_forward(&run, &input);
-        for (int64_t y = 0; y < height && result == GSF_OK; y++)
-            for (int64_t x = 0; x < 3 * width; x++) {
-                const double truth = (double)s.truth[y * 3 * width + x];
-                const double a = (double)s.frame[(y * width + x / 3) * GSF__MINI_FRAME + x % 3] - truth;
-                const double b = (double)gsf__mini_clamp(run.out[y * 3 * run.width + x], 0.0f, 1.0f) - truth;
-                squares[0] += a * a;
-                squares[1] += b * b;
-            }
-        *before += decibels(squares[0] / (3.0 * (double)pixels)) / (double)frames->shape[0];
-        *after += decibels(squares[1] / (3.0 * (double)pixels)) / (double)frames->shape[0];
+        figures squares;
+        for (int64_t i = 0; i < pixels; i++) read_pixel(from + i * DATA_PIXEL, c.sample, i, pixels);
+        result = measure_frame(&c, &squares);
+        add_frame(all, squares, share);
+        const float part = (float)fmin(1.0, sqrt(pow(10.0, -0.1 * GOOD_DECIBELS) / fmax(squares.before, 1e-10)));
+        for (int64_t i = 0; i < pixels; i++) better_pixel(part, c.sample, i, pixels);
+        if (result == GSF_OK) result = measure_frame(&c, &squares);
+        add_frame(good, squares, share);
     }
-    gsf__mini_end(&run);
+    gsf__mini_end(&c.run);
     gsf_free(&t->ctx, memory);
     return result;
 }
 
 static gsf_result check(training* t) {
     gsf__mini net;
-    double sum[2] = {0.0, 0.0};
+    figures sum = {0.0, 0.0}, good_sum = {0.0, 0.0};
+    const double share = 1.0 / (double)t->check_count;
     if (!t->check_count) return GSF_OK;
     gsf_result result = gsf__mini_open(&t->ctx, t->o.out, NULL, 0, &net);
     for (size_t i = 0; i < t->check_count && result == GSF_OK; i++) {
-        double before, after;
-        result = check_scene(t, &net, t->scenes[t->scene_count + i], &before, &after);
+        figures all, good;
+        result = check_scene(t, &net, t->scenes[t->scene_count + i], &all, &good);
         if (result != GSF_OK) break;
-        printf("scene %llu: %.2f -> %.2f dB\n", (unsigned long long)(t->o.check.first + i), before, after);
-        sum[0] += before / (double)t->check_count;
-        sum[1] += after / (double)t->check_count;
+        printf("scene %llu: %.2f -> %.2f dB; nearly right: %.2f -> %.2f dB\n", (unsigned long long)(t->o.check.first + i),
+               all.before, all.after, good.before, good.after);
+        sum.before += share * all.before, sum.after += share * all.after;
+        good_sum.before += share * good.before, good_sum.after += share * good.after;
     }
-    if (result == GSF_OK) printf("mean: %.2f -> %.2f dB (%+.2f)\n", sum[0], sum[1], sum[1] - sum[0]);
+    if (result == GSF_OK) {
+        printf("mean: %.2f -> %.2f dB (%+.2f)\n", sum.before, sum.after, sum.after - sum.before);
+        printf("nearly right: %.2f -> %.2f dB\n", good_sum.before, good_sum.after);
+    }
     gsf__mini_close(&t->ctx, &net);
     return result;
 }
@@ -258,7 +294,7 @@ static gsf_result check(training* t) {
 
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
-                "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.0005] [--seed 1] [--save-every 500] [--init FILE]\n"
+                "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
                 "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
@@ -310,7 +346,7 @@ static int parse_options(int argc, char** argv, options* o) {
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 5e-4};
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;

@@ -72,11 +72,11 @@ static double* level(const twin* t, int l, const double* x, int h, int w) {
     return y;
 }
 
-// out (height, width, 3), error (height, width) of one frame
+// out (height, width, 3), error (height, width, 2: of the result, of the render) of one frame
 static void run_twin(const twin* t, const gsf__mini_input* in, double* out, double* error) {
     enum { H = HEIGHT / 2, W = WIDTH / 2, COARSE = H * W };
     const int e = (int)t->net->features, hidden = (int)t->net->hidden, s = (int)t->net->shared, pitch = 20 + 2 * e;
-    double *frame = doubles(COARSE * pitch), *features = doubles(REFERENCES * COARSE * e), *head = doubles(COARSE * 24);
+    double *frame = doubles(COARSE * pitch), *features = doubles(REFERENCES * COARSE * e), *head = doubles(COARSE * 28);
     double *choices = doubles(REFERENCES * COARSE * 12), *shown = doubles(REFERENCES * COARSE * 56);
     double* common = doubles(COARSE * s);
     double *attention = doubles(REFERENCES * COARSE), *first = doubles(COARSE * hidden), *heads = doubles(COARSE * s);
@@ -138,23 +138,24 @@ static void run_twin(const twin* t, const gsf__mini_input* in, double* out, doub
     }
     for (int i = 0; i < PIXELS; i++) {
         const int x = i % WIDTH, row = i / WIDTH, at = (row / 2 * W + x / 2) * 4 + row % 2 * 2 + x % 2;
-        double weight[CANDIDATES], sum = 0.0, *h = head + at * 6;
+        double weight[CANDIDATES], sum = 0.0, *h = head + at * 7;
         for (int k = 0; k < CANDIDATES; k++) {
             const int r = (k - 2) / 3, c = (k - 2) % 3;
             const double* o = shown + (k < 2 ? 0 : (r * COARSE * 4 + at) * 14);
             weight[k] = k < 2 ? exp(h[k]) : o[c < 2 ? 6 : 12] > 0.0 ? exp(choices[(r * COARSE * 4 + at) * 3 + c]) : 0.0;
             sum += weight[k];
         }
+        const double part = (h[6] - log(0.012)) / log(2.0), gate = part > 1.0 ? 1.0 : part > 0.0 ? part : 0.0;
         for (int c = 0; c < 3; c++) {
-            double value = (double)in->frame[i * 5 + c] + weight[1] / sum * 0.5 * h[2 + c];
+            double value = weight[1] / sum * 0.5 * h[2 + c];
             for (int k = 2; k < CANDIDATES; k++) {
                 const double* o = shown + ((k - 2) / 3 * COARSE * 4 + at) * 14;
                 const int kind = (k - 2) % 3;
                 value += weight[k] / sum * (kind == 0 ? 0.5 * o[c] : kind == 1 ? 0.25 * o[3 + c] : 0.5 * o[9 + c]);
             }
-            out[3 * i + c] = value;
+            out[3 * i + c] = (double)in->frame[i * 5 + c] + gate * value;
         }
-        error[i] = h[5] > 0.0 ? 0.0 : h[5] > -6.0 ? h[5] : -6.0;
+        for (int k = 0; k < 2; k++) error[2 * i + k] = h[5 + k] > 0.0 ? 0.0 : h[5 + k] > -6.0 ? h[5 + k] : -6.0;
     }
     free(frame), free(features), free(head), free(choices), free(shown), free(common), free(attention), free(first);
     free(heads), free(y);
@@ -217,27 +218,33 @@ static double difference(const float* a, const double* b, size_t count) { // rel
 // ---- results and gradients -------------------------------------------------------
 
 static void test_gradients(gsf_context* ctx) {
-    enum { RESULT = BATCH * PIXELS * 3, MISTAKE = BATCH * PIXELS, EACH = 24 };
-    static float dout[RESULT], derror[MISTAKE];
+    enum { RESULT = BATCH * PIXELS * 3, MISTAKE = BATCH * PIXELS * 2, EACH = 24 };
+    static float dout[RESULT], derror[MISTAKE], errors[MISTAKE];
     static double out[2][RESULT], error[2][MISTAKE];
     gsf__mini net, sizes = tiny();
     gsf__nn_params params;
     gsf__mini_run run;
     gsf__mini_input in[BATCH];
-    seed = 7;
+    seed = 10; // no unit and no gate is as near to its kink as the differences step
     make_inputs(in, BATCH, WIDTH, HEIGHT, REFERENCES, planes);
     CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 1, made_path()));
     if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
     CHECK_OK(ctx, gsf__nn_make_params(ctx, &net.weights, NULL, 0, &params));
     double* values = (double*)malloc((size_t)params.count * sizeof *values);
+    const gsf_nn_tensor* bias = gsf_nn_find_tensor(&net.weights, "head.bias");
+    for (int64_t i = 6; i < bias->count; i += GSF__MINI_HEAD) // gates between open and closed, and some of both
+        params.value[params.at[bias - net.weights.tensors] + i] = gsf__mini_kept + 0.1f;
     for (int64_t i = 0; i < params.count; i++) values[i] = (double)(params.value[i] += (float)test_random_in(&seed, -0.3, 0.3));
     for (int i = 0; i < RESULT; i++) dout[i] = (float)test_random_in(&seed, -1.0, 1.0);
     for (int i = 0; i < MISTAKE; i++) derror[i] = (float)test_random_in(&seed, -1.0, 1.0);
     const twin t = {&net, &params, values};
-    for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[0] + 3 * PIXELS * b, error[0] + PIXELS * b);
+    for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[0] + 3 * PIXELS * b, error[0] + 2 * PIXELS * b);
     CHECK_OK(ctx, gsf__mini_begin(ctx, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 0, &run)); // results without training
     CHECK_OK(ctx, gsf__mini_forward(&run, in));
     CHECK_NEAR(difference(run.out, out[0], RESULT), 0.0, 1e-6);
+    int open = 0, closed = 0;
+    for (int64_t i = 0; i < BATCH * PIXELS; i++) open += run.fault[i] >= logf(0.024f), closed += run.fault[i] <= gsf__mini_kept;
+    CHECK(open > 50 && closed > 50 && open + closed < BATCH * PIXELS - 50);
     gsf__mini_end(&run);
     float* grad = (float*)malloc((size_t)params.count * sizeof *grad);
     for (int k = 0; k < 2; k++) {
@@ -249,9 +256,10 @@ static void test_gradients(gsf_context* ctx) {
         CHECK_OK(&others, gsf__mini_begin(&others, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 1, &run));
         CHECK_OK(&others, gsf__mini_forward(&run, in));
         CHECK_NEAR(difference(run.out, out[0], RESULT), 0.0, 1e-6);
-        CHECK_NEAR(difference(run.error, error[0], MISTAKE), 0.0, 1e-6);
+        for (int i = 0; i < MISTAKE; i++) errors[i] = i % 2 ? run.fault[i / 2] : run.error[i / 2];
+        CHECK_NEAR(difference(errors, error[0], MISTAKE), 0.0, 1e-6);
         memcpy(run.dout, dout, sizeof dout);
-        memcpy(run.derror, derror, sizeof derror);
+        for (int i = 0; i < MISTAKE; i++) *(i % 2 ? run.dfault + i / 2 : run.derror + i / 2) = derror[i];
         memset(params.grad, 0, (size_t)params.count * sizeof *params.grad);
         CHECK_OK(&others, gsf__mini_backward(&run, &params));
         gsf__mini_end(&run);
@@ -268,7 +276,7 @@ static void test_gradients(gsf_context* ctx) {
             double slope = 0.0;
             for (int side = 0; side < 2; side++) { // differences of results: those of their sums would be less exact
                 *p = before + (side ? step : -step);
-                for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[side] + 3 * PIXELS * b, error[side] + PIXELS * b);
+                for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[side] + 3 * PIXELS * b, error[side] + 2 * PIXELS * b);
             }
             for (int j = 0; j < RESULT; j++) slope += (out[1][j] - out[0][j]) * (double)dout[j] / (2.0 * step);
             for (int j = 0; j < MISTAKE; j++) slope += (error[1][j] - error[0][j]) * (double)derror[j] / (2.0 * step);
@@ -292,24 +300,27 @@ static void test_gradients(gsf_context* ctx) {
 static double loss_of(const gsf__mini_run* r, const gsf__mini_input* in, const float* truth, int moved, int at, double step) {
     double total = 0.0;
     for (int b = 0; b < BATCH; b++) {
-        double sums[5] = {0};
+        double sums[6] = {0};
         for (int i = 0; i < 3 * PIXELS; i++) {
             const int pixel = b * PIXELS + i / 3, x = i / 3 % WIDTH, y = i / 3 / WIDTH;
 #define MISS(k) ((double)r->out[k] + (moved == 1 && (k) == at ? step : 0.0) - (double)truth[k])
             const int k = 3 * b * PIXELS + i;
             const double e = MISS(k), render = (double)(in[b].frame[i / 3 * 5 + i % 3] - 0.5f) + 0.5 - (double)truth[k];
             const double log_error = (double)r->error[pixel] + (moved == 2 && pixel == at ? step : 0.0);
+            const double fault = (double)r->fault[pixel] + (moved == 3 && pixel == at ? step : 0.0);
             sums[0] += sqrt(e * e + 1e-3);
             sums[1] += e * e;
             sums[2] += render * render;
             sums[3] += (fabs((double)r->out[k] - (double)truth[k]) * exp(-log_error) + log_error) / 3.0;
             if (moved == 1) sums[3] = 0.0; // its slope does not reach the colours
+            sums[5] += (fabs(render) * exp(-fault) + fault) / 3.0;
             if (x + 1 < WIDTH) sums[4] += fabs(MISS(k + 3) - e);
             if (y + 1 < HEIGHT) sums[4] += fabs(MISS(k + 3 * WIDTH) - e);
 #undef MISS
         }
         const double n = 3.0 * PIXELS;
-        total += (sums[1] / n / (sums[2] / n + 1e-2) + 2.0 * sums[0] / n + 0.5 * sums[4] / n + 0.02 * sums[3] / PIXELS) / BATCH;
+        total += (sums[1] / n / (sums[2] / n + 2e-3) + 2.0 * sums[0] / n + 0.5 * sums[4] / n +
+                  0.02 * (sums[3] + sums[5]) / PIXELS) / BATCH;
     }
     return total;
 }
@@ -335,6 +346,8 @@ static void test_loss(gsf_context* ctx) {
         const double error = loss_of(&run, in, truth, 2, pixel, step) - loss_of(&run, in, truth, 2, pixel, -step);
         CHECK_NEAR((double)run.dout[at], color / (2.0 * step), 1e-7);
         CHECK_NEAR((double)run.derror[pixel], error / (2.0 * step), 1e-7);
+        const double fault = loss_of(&run, in, truth, 3, pixel, step) - loss_of(&run, in, truth, 3, pixel, -step);
+        CHECK_NEAR((double)run.dfault[pixel], fault / (2.0 * step), 1e-7);
     }
     gsf__mini_end(&run);
     gsf__mini_close(ctx, &net);
@@ -363,6 +376,36 @@ static void test_start(gsf_context* ctx) {
     CHECK(most < 0.025);
     gsf__mini_end(&run);
     gsf__mini_close(ctx, &net);
+}
+
+// A render whose expected error is small stays as it is.
+static void test_gate(gsf_context* ctx) {
+    static float biases[4 * GSF__MINI_HEAD];
+    gsf__mini net, sizes = tiny();
+    gsf__mini_run run;
+    gsf__mini_input in;
+    double most[2] = {0.0, 0.0};
+    make_inputs(&in, 1, WIDTH, HEIGHT, REFERENCES, planes);
+    for (int closed = 0; closed < 2; closed++) {
+        CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 3, made_path()));
+        if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
+        gsf_nn_tensor* tensors = (gsf_nn_tensor*)malloc(net.weights.tensor_count * sizeof *tensors);
+        memcpy(tensors, net.weights.tensors, net.weights.tensor_count * sizeof *tensors);
+        for (int i = 0; i < 4 * GSF__MINI_HEAD; i++) biases[i] = i % GSF__MINI_HEAD < 6 ? 0.0f : closed ? -4.5f : -3.5f;
+        tensors[gsf_nn_find_tensor(&net.weights, "head.bias") - net.weights.tensors].data = biases;
+        CHECK_OK(ctx, gsf_nn_save_tensors(ctx, made_path(), tensors, net.weights.tensor_count));
+        free(tensors);
+        gsf__mini_close(ctx, &net);
+        if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
+        CHECK_OK(ctx, gsf__mini_begin(ctx, &net, 1, REFERENCES, WIDTH, HEIGHT, 0, &run));
+        CHECK_OK(ctx, gsf__mini_forward(&run, &in));
+        for (int i = 0; i < 3 * PIXELS; i++)
+            most[closed] = fmax(most[closed], fabs((double)(run.out[i] - in.frame[i / 3 * GSF__MINI_FRAME + i % 3])));
+        gsf__mini_end(&run);
+        gsf__mini_close(ctx, &net);
+    }
+    CHECK(most[0] > 0.1);
+    CHECK_NEAR(most[1], 0.0, 6e-8);
 }
 
 // The same for references in another order, but for rounding.
@@ -478,14 +521,14 @@ static void test_restorer(gsf_context* ctx) {
         static float surplus[1];
         size_t count = net.weights.tensor_count;
         const size_t at = (size_t)(gsf_nn_find_tensor(&net.weights, "head.bias") - net.weights.tensors);
-        float broken[24];
+        float broken[28];
         memcpy(tensors, net.weights.tensors, count * sizeof *tensors);
         if (fault == 0) tensors[at] = tensors[--count];
         if (fault == 1) {
             const int64_t shape[1] = {1};
             tensors[count++] = gsf_nn_wrap_tensor("surplus", surplus, 1, shape);
         }
-        if (fault == 2) tensors[at].shape[0] = tensors[at].count = 23;
+        if (fault == 2) tensors[at].shape[0] = tensors[at].count = 27;
         if (fault == 3) tensors[at].dtype = GSF_NN_I32;
         if (fault == 4) {
             memcpy(broken, tensors[at].data, sizeof broken);
@@ -560,6 +603,7 @@ int main(void) {
     }
     test_loss(&ctx);
     test_start(&ctx);
+    test_gate(&ctx);
     test_restorer(&ctx);
     test_memory();
     return test_report();
