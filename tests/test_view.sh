@@ -14,8 +14,9 @@ view() { # as the user's command, in a window
     if command -v xvfb-run > /dev/null; then xvfb-run -a -s "-screen 0 1280x800x24" "$gsfix" view "$@"
     else SDL_VIDEODRIVER=dummy "$gsfix" view "$@"; fi
 }
-view "$scene" --screenshot nothing.png --iterations 0 > log 2>&1 && fail "0 iterations are accepted"
+view nothing.ply --screenshot nothing.png > log 2>&1 && fail "a missing file is shown"
 grep -q "no window system" log && { echo "SKIPPED: built without SDL2"; exit 77; }
+grep -q "nothing.ply" log || fail "a missing file is not named"
 view "$scene" --views 3 --iterations 100 --screenshot scene.png --orbit 20 --json > log 2>&1 || fail "the scene is not shown"
 number() { grep -o "\"$1\":[-+.0-9e]*" log | head -n 1 | cut -d : -f 2; }
 awk -v a="$(number psnr_before)" -v b="$(number psnr)" 'BEGIN { exit !(a != "" && b > a + 3) }' || fail "PSNR does not rise"
