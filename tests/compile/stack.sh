@@ -16,5 +16,5 @@ sed -n "s|^$root/||; 1,3p" "$work/sorted"
 most=$(head -n 1 "$work/sorted" | cut -f 2)
 [ "$(wc -l < "$work/sorted")" -gt 100 ] && [ "$most" -le 32768 ] || { echo "FAILED: $most bytes of stack"; exit 1; }
 [ "$level" = -O0 ] && exit
-most=$(grep -v gsf__conv_segment "$work/sorted" | head -n 1 | cut -f 2)
+most=$(awk -F '\t' '!/gsf__conv_segment/ { print $2; exit }' "$work/sorted")
 [ "$most" -le 16384 ] || { echo "FAILED: $most bytes of stack at $level"; exit 1; }
