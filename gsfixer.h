@@ -455,8 +455,9 @@ typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
                                     // nothing: the loop compares it with the renders to find windows that need no
                                     // repair, instead of reprojecting the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
-    int32_t needs_carried;          // references per frame that it asks for with carry_fn; 0 = none. A restorer sets it
-                                    // only if struct_size covers it
+    // A restorer sets what follows only if struct_size covers it.
+    int32_t needs_carried;          // references per frame that it asks for with carry_fn; 0 = none
+    float lambda;                   // preferred weight of its frames in training, used by default; 0: no preference
 } gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on

@@ -130,6 +130,7 @@ typedef struct gsf_splats { // structure of arrays; all arrays have `count` rows
     size_t count;
     int32_t sh_degree;      // 0..3, of the stored coefficients
     int32_t antialiased;    // made for gsf_render_desc.antialiased; informative, stored in .spz files only
+    float background[3];    // colour behind the splats in training; informative, stored in .ply files only
     double origin[3];       // world position that the means are relative to
     float* means;           // (count,3) relative to origin
     float* log_scales;      // (count,3)
@@ -489,6 +490,13 @@ typedef struct gsf_train_view {
                        // nor the render there is read. Colours are not multiplied by alpha
 } gsf_train_view;
 
+typedef enum gsf_background { // the colour behind the splats in training
+    GSF_BACKGROUND_GIVEN,     // `background`
+    GSF_BACKGROUND_PHOTOS,    // the mean colour of the photos, by their weights, which then is `background`. Whatever no
+                              // photo shows is then least wrong
+    GSF_BACKGROUND_RANDOM     // a new random colour in each step; other renders show `background`
+} gsf_background;
+
 // Zero = the value given beside each field, that of Inria's 3DGS; s = iterations / 30000. Negative = zero for all learning
 // rates except lr_means_final, for lambda_ssim, densify_from, densify_grad, densify_scale and prune_opacity, and where a
 // field says so.
@@ -509,7 +517,7 @@ typedef struct gsf_train_desc {
                                    // coincide, the median depth of the splats
     float lambda_ssim;             // 0.2; negative = 0: no SSIM term
     float background[3];           // colour behind the splats
-    int32_t background_random;     // 0; 1: a new random colour in each step instead of `background`
+    gsf_background background_kind;
     int32_t densify_from, densify_until; // 500 s, 15000 s (mcmc: 25000 s); densify_until < 0 = never, nor opacity resets
     int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
@@ -634,7 +642,8 @@ typedef struct gsf_fix_desc {
     int32_t windows;              // per round; 0 = one per training view, at least 2
     int32_t window_frames;        // 0 = the restorer's preferred count, else 17; changed to the nearest count that it
                                   // accepts
-    float lambda;                 // weight of the restored views at the end of training, default 1; negative = 0
+    float lambda;                 // weight of the restored views at the end of training, default what the restorer
+                                  // prefers, or 1; negative = 0
     float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
                                   // pixels that the references explain; 0 = never skip
     int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
@@ -1008,6 +1017,7 @@ typedef struct gsf__ply { // a validated header; in binary files `count` rows of
     gsf__ply_target targets[GSF__PLY_RED]; // all columns of a splat except x y z
     size_t target_count;
     int all_f32;                           // every target column is little-endian float32, as in nearly all files
+    float background[3];                   // of the toolkit's own comment; 0 without it
 } gsf__ply;
 
 static int gsf__is_blank(unsigned char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
@@ -1192,6 +1202,20 @@ static gsf_result gsf__ply_place_body(gsf_context* ctx, gsf__ply* ply, uint64_t 
     return GSF_OK;
 }
 
+// Takes the toolkit's own comment, "background R G B", and passes over all others.
+static void gsf__ply_read_comment(gsf__ply* ply, const char* at, const char* end) {
+    const char* word;
+    size_t length = gsf__next_word(&at, end, &word);
+    double rgb[3];
+    if (!gsf__word_is(word, length, "background")) return;
+    for (int c = 0; c < 3; c++) {
+        length = gsf__next_word(&at, end, &word);
+        if (!length || !gsf__word_double(word, length, &rgb[c]) || !(fabs(rgb[c]) <= 1e3)) return;
+    }
+    if (gsf__next_word(&at, end, &word) == 0)
+        for (int c = 0; c < 3; c++) ply->background[c] = (float)rgb[c];
+}
+
 static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const void* data, size_t size,
                                        gsf__ply* ply) {
     memset(ply, 0, sizeof *ply);
@@ -1238,7 +1262,9 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
             GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, has_vertex, &before));
             ply->body = (size_t)(stop - text) + 1;
             break;
-        } else if (!gsf__word_is(word, length, "comment") && !gsf__word_is(word, length, "obj_info") && length) {
+        } else if (gsf__word_is(word, length, "comment")) {
+            gsf__ply_read_comment(ply, at, stop);
+        } else if (!gsf__word_is(word, length, "obj_info") && length) {
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: unknown header line \"%.*s\"", name, line,
                             (int)(length < 40 ? length : 40), word);
         }
@@ -1530,6 +1556,7 @@ static gsf_result gsf__parse_ply(gsf_context* ctx, const char* name, const void*
     gsf_result result = gsf__ply_parse_text(ctx, &ply, &values);
     if (result == GSF_OK) result = gsf_splat_make(ctx, ply.count, degree, out);
     if (result == GSF_OK) {
+        memcpy(out->background, ply.background, sizeof out->background);
         gsf__ply_list_targets(&ply, out);
         result = gsf__decode_splats(ctx, name, &ply, gsf__ply_position, gsf__ply_decode_chunk, out);
     }
@@ -1609,7 +1636,11 @@ static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gs
     job.splats = splats;
     job.wide = origin[0] != 0.0 || origin[1] != 0.0 || origin[2] != 0.0;
     job.row_bytes = 4 * (size_t)(17 + rest) + (job.wide ? 12 : 0);
-    gsf_append_text(ctx, out, "ply\nformat binary_little_endian 1.0\nelement vertex %zu\n", splats->count);
+    const float* b = splats->background;
+    gsf_append_text(ctx, out, "ply\nformat binary_little_endian 1.0\n");
+    if (b[0] != 0.0f || b[1] != 0.0f || b[2] != 0.0f)
+        gsf_append_text(ctx, out, "comment background %.9g %.9g %.9g\n", (double)b[0], (double)b[1], (double)b[2]);
+    gsf_append_text(ctx, out, "element vertex %zu\n", splats->count);
     for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property %s %c\n", job.wide ? "double" : "float", "xyz"[k]);
     for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float n%c\n", "xyz"[k]);
     for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float f_dc_%d\n", k);
@@ -11403,7 +11434,6 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
         d.scale_penalty = gsf__or_zero(d.scale_penalty, 0.01f);
         d.opacity_penalty = gsf__or_zero(d.opacity_penalty, 0.01f);
     }
-    memcpy(d.render.background, d.background, sizeof d.background);
     return d;
 }
 
@@ -11435,7 +11465,7 @@ static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN
         {"background[0]", (double)d->background[0], -1e3, 1e3},
         {"background[1]", (double)d->background[1], -1e3, 1e3},
         {"background[2]", (double)d->background[2], -1e3, 1e3},
-        {"background_random", (double)d->background_random, 0, 1},
+        {"background_kind", (double)d->background_kind, 0, GSF_BACKGROUND_RANDOM},
         {"densify_grad", (double)d->densify_grad, 0, 1e30},
         {"densify_scale", (double)d->densify_scale, 0, 1e30},
         {"densify_absolute", (double)d->densify_absolute, -INFINITY, INFINITY},
@@ -11642,6 +11672,23 @@ static void gsf__trainer_prepare_lazy(const gsf_context* ctx, gsf_trainer* train
                       gsf__trainer_bands(trainer, trainer->iteration));
 }
 
+// The mean colour of the photos, by their weights; black if all weights are 0.
+static void gsf__photo_set_mean(const gsf__photo_set* set, float out[3]) {
+    double sum[3] = {0.0, 0.0, 0.0}, total = 0.0;
+    for (size_t p = 0; p < set->count; p++) {
+        const gsf__target* t = &set->photos[p].target;
+        for (size_t i = 0; i < (size_t)t->width * (size_t)t->height; i++) {
+            const double w = t->weight ? (double)t->weight[i] : 1.0;
+            total += w;
+            for (size_t c = 0; c < 3; c++) sum[c] += w * (t->u8 ? (double)t->u8[3 * i + c] / 255.0 : (double)t->f32[3 * i + c]);
+        }
+    }
+    for (int c = 0; c < 3; c++) {
+        const double mean = total > 0.0 ? sum[c] / total : 0.0;
+        out[c] = (float)(mean < 0.0 ? 0.0 : mean > 1.0 ? 1.0 : mean);
+    }
+}
+
 static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
                                      size_t view_count, const gsf_splats* initial) {
     const int near_given = trainer->desc.render.near_plane != 0.0f;
@@ -11649,6 +11696,10 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     if (view_count == 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no training view");
     GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", &trainer->photos));
     if (trainer->desc.coarse_until > 0) GSF__TRY(gsf__photo_set_halve(ctx, &trainer->photos, &trainer->coarse));
+    if (trainer->desc.background_kind == GSF_BACKGROUND_PHOTOS)
+        gsf__photo_set_mean(&trainer->photos, trainer->desc.background);
+    memcpy(trainer->desc.render.background, trainer->desc.background, sizeof trainer->desc.background);
+    memcpy(trainer->view.background, trainer->desc.background, sizeof trainer->view.background);
     GSF__TRY(gsf__trainer_take_splats(ctx, trainer, initial));
     if (trainer->desc.extent == 0.0f) GSF__TRY(gsf__trainer_find_extent(ctx, trainer));
     if (!near_given) {
@@ -11842,7 +11893,7 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
         render.hidden = model->hidden;
         render.opacity_scale = (float)(1.0 / (1.0 - share));
     }
-    for (uint64_t c = 0; c < 3 && d->background_random; c++)
+    for (uint64_t c = 0; c < 3 && d->background_kind == GSF_BACKGROUND_RANDOM; c++)
         render.background[c] = (float)gsf_draw_uniform(d->seed, gsf__stream(GSF__STREAM_BACKGROUND, (uint64_t)iteration),
                                                        3 * (uint64_t)which + c);
     const int32_t width = photo->camera.width, height = photo->camera.height;
@@ -12281,6 +12332,7 @@ GSF_API gsf_result gsf_splat_copy_trained(gsf_context* ctx, const gsf_trainer* t
     GSF__TRY(gsf_splat_make(ctx, view->count, view->sh_degree, out));
     gsf__column from[GSF__SPLAT_COLUMNS], to[GSF__SPLAT_COLUMNS];
     memcpy(out->origin, view->origin, sizeof out->origin);
+    memcpy(out->background, view->background, sizeof out->background);
     gsf__splat_columns(view, from);
     gsf__splat_columns(out, to);
     for (int k = 0; k < GSF__SPLAT_COLUMNS && view->count; k++) memcpy(to[k].data, from[k].data, view->count * to[k].row);
@@ -13889,6 +13941,7 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     if (!f->cameras) result = GSF_ERROR_OUT_OF_MEMORY;
     for (; f->cameras && f->view_count < view_count; f->view_count++) f->cameras[f->view_count] = views[f->view_count].camera;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
+    if (desc->lambda == 0.0f && f->limits.lambda > 0.0f && f->limits.lambda <= 1e6f) f->desc.lambda = f->limits.lambda;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
         result = gsf_splat_make_warp(ctx, &f->explain);
@@ -14644,6 +14697,7 @@ GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf
     desc.train.dropout = 0.1f;
     desc.train.opacity_decay = 0.002f;
     desc.train.depth_smoothness = 0.5f;
+    desc.train.background_kind = GSF_BACKGROUND_PHOTOS;
     desc.train.lazy_adam = quality == GSF_QUALITY_FAST;
     desc.skip_psnr = quality == GSF_QUALITY_EXACT ? 0.0f : quality == GSF_QUALITY_FAST ? 36.0f : 45.0f;
     desc.max_pixels = quality == GSF_QUALITY_FAST ? 320 * 240 : 0;

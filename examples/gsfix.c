@@ -137,7 +137,8 @@ static const option_spec option_specs[] = {
      "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
      "on nor measured, grey ones count partially (default on)"},
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
-     "background colour: black (default), white, R,G,B from 0 to 1, or (fix) random, a new one in each step"},
+     "background colour: black, white, R,G,B from 0 to 1 or, for fix, photos (their mean colour, the default unless\n"
+     "--regularize is off) or random (a new one in each step); by default, render takes that of SPLATS.ply, or else black"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset evaluate", "go on with what an interrupted run has left in OUT"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",
@@ -374,18 +375,19 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
 
 // ---- scenes and restorers --------------------------------------------------------
 
-int gsfix_background(gsfix_app* app, float out[3], int32_t* random) {
-    const char* text = app->o.background ? app->o.background : "black";
+int gsfix_background(gsfix_app* app, const char* text, float out[3], gsf_background* kind) {
     const float grey = strcmp(text, "white") == 0 ? 1.0f : 0.0f;
-    *random = strcmp(text, "random") == 0;
+    *kind = strcmp(text, "photos") == 0   ? GSF_BACKGROUND_PHOTOS
+            : strcmp(text, "random") == 0 ? GSF_BACKGROUND_RANDOM
+                                          : GSF_BACKGROUND_GIVEN;
     for (int c = 0; c < 3; c++) out[c] = grey;
-    if (grey > 0.0f || *random || strcmp(text, "black") == 0) return 0;
+    if (grey > 0.0f || *kind != GSF_BACKGROUND_GIVEN || strcmp(text, "black") == 0) return 0;
     const char* p = text;
     for (int c = 0; c < 3; c++) {
         char* end;
         out[c] = strtof(p, &end);
         if (end == p || !(out[c] >= 0.0f && out[c] <= 1.0f) || *end != (c < 2 ? ',' : 0))
-            return gsfix_misused(app, "--background %s: not black, white, random or R,G,B from 0 to 1", text);
+            return gsfix_misused(app, "--background %s: not photos, black, white, random or R,G,B from 0 to 1", text);
         p = end + 1;
     }
     return 0;
@@ -746,6 +748,9 @@ static gsf_result info_splats(gsfix_app* app) {
         gsfix_json_number(&app->ctx, json, "splats", (double)s.count);
         gsfix_json_number(&app->ctx, json, "sh_degree", s.sh_degree);
         gsfix_json_bool(&app->ctx, json, "antialiased", s.antialiased);
+        gsfix_json_begin(&app->ctx, json, "background", '[');
+        for (int c = 0; c < 3; c++) gsfix_json_number(&app->ctx, json, NULL, (double)s.background[c]);
+        gsfix_json_end(&app->ctx, json, ']');
         gsfix_print(app, "splats     %zu of SH degree %d%s", s.count, (int)s.sh_degree, s.antialiased ? ", antialiased" : "");
         for (size_t i = 0; i < 3 * s.count; i++) world[i] = (double)s.means[i] + s.origin[i % 3];
         print_box(app, "extent", world, s.count);
@@ -880,7 +885,7 @@ static gsf_result filter_one(gsfix_app* app, const render_filter* f, const gsf_c
     return result;
 }
 
-static gsf_result render_all(gsfix_app* app, const float background[3]) {
+static gsf_result render_all(gsfix_app* app, const float* background) { // NULL: that of the splats
     gsf_context* ctx = &app->ctx;
     gsf_scene scene = {0};
     gsf_splats splats = {0};
@@ -893,7 +898,7 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
     gsf_render_desc desc = {0};
     gsf_result result = gsf_splat_load(ctx, app->o.inputs[0], &splats);
     desc.antialiased = splats.antialiased;
-    memcpy(desc.background, background, sizeof desc.background);
+    memcpy(desc.background, background ? background : splats.background, sizeof desc.background);
     if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
     if (result == GSF_OK && !app->o.path) count = scene.view_count;
@@ -936,12 +941,13 @@ static int run_render(gsfix_app* app) {
         return gsfix_misused(app, "--restorer %s: render takes none|warp|mini[:FILE]", r);
     if (filtered && !app->o.scene) return gsfix_misused(app, "--restorer: needs the photos of a --scene");
     if (!filtered && !app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
+    const char* text = app->o.background;
     float background[3];
-    int32_t random;
-    const int code = gsfix_background(app, background, &random);
+    gsf_background kind;
+    const int code = text ? gsfix_background(app, text, background, &kind) : 0;
     if (code) return code;
-    if (random) return gsfix_misused(app, "--background random: for training only");
-    return render_all(app, background) == GSF_OK ? 0 : gsfix_failed(app);
+    if (text && kind != GSF_BACKGROUND_GIVEN) return gsfix_misused(app, "--background %s: for training only", text);
+    return render_all(app, text ? background : NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- filter ----------------------------------------------------------------------

@@ -424,6 +424,7 @@ static gsf_result perturb(scene_run* run, const gsf_splats* clean, int kind, int
     gsf_result result = gsf_splat_make(run->ctx, clean->count, clean->sh_degree, out);
     if (result != GSF_OK) return result;
     memcpy(out->origin, clean->origin, sizeof out->origin);
+    memcpy(out->background, clean->background, sizeof out->background);
     for (size_t i = 0; i < clean->count; i++) {
         if (kind == KIND_PRUNE && gsf_draw_uniform(seed, stream, clean->ids[i]) < strength) continue;
         memcpy(out->means + 3 * n, clean->means + 3 * i, 3 * sizeof(float));
@@ -484,6 +485,7 @@ static gsf_result render_frame(scene_run* run, const gsf_splats* splats, int kin
     gsf_render_output out = {0};
     gsf_image* color = &b->images[at];
     desc.near_plane = run->near_plane;
+    memcpy(desc.background, splats->background, sizeof desc.background);
     b->paths[at] = at_out(run, frame_file(run, kind, k, frame, GSFIX_ARTIFACT));
     b->paths[at + 1] = at_out(run, frame_file(run, kind, k, frame, GSFIX_ALPHA));
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, color);

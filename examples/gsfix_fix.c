@@ -153,11 +153,13 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     gsf_train_desc* train = &setup->fix.train;
     if (app->o.iterations) train->iterations = app->o.iterations;
     train->seed = app->o.seed;
-    if (app->o.regularize && strcmp(app->o.regularize, "off") == 0)
+    const int regularized = !app->o.regularize || strcmp(app->o.regularize, "off") != 0;
+    if (!regularized)
         train->dropout = train->opacity_decay = train->scale_penalty = train->opacity_penalty = train->depth_smoothness = 0.0f;
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     int code = apply_settings(app, setup);
-    if (!code) code = gsfix_background(app, train->background, &train->background_random);
+    const char* background = app->o.background ? app->o.background : regularized ? "photos" : "black";
+    if (!code) code = gsfix_background(app, background, train->background, &train->background_kind);
     if (code) return code;
     if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // an explicit 0: the desc's zero means default
     if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
@@ -433,6 +435,7 @@ static void write_switches(fix_run* run) {
     gsf_buffer* t = &run->switches;
     const gsfix_options* o = &run->app->o;
     static const char* const kinds[] = {"reference", "ellipse", "interpolate", "spread"};
+    static const char* const backgrounds[] = {"given", "photos", "random"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     gsfix_setup used = run->setup;
     used.fix = gsf_splat_get_fixer_desc(run->fixer);
@@ -464,7 +467,7 @@ static void write_switches(fix_run* run) {
     gsfix_json_begin(ctx, t, "background", '[');
     for (int c = 0; c < 3; c++) gsfix_json_number(ctx, t, NULL, as_written(train->background[c]));
     gsfix_json_end(ctx, t, ']');
-    gsfix_json_text(ctx, t, "background_random", train->background_random ? "on" : "off");
+    gsfix_json_text(ctx, t, "background_kind", backgrounds[train->background_kind]);
     gsfix_json_text(ctx, t, "photo_masks", o->photo_masks ? o->photo_masks : "on");
     gsfix_json_number(ctx, t, "photos_masked", (double)masked_photos(run));
     gsfix_json_text(ctx, t, "views", o->views ? o->views : "all");

@@ -158,6 +158,7 @@ static gsf_result view_open_splats(viewer* v) {
     v->up[1] = -1.0;
     v->desc.near_plane = (float)(0.02 * radius);
     v->desc.antialiased = v->splats.antialiased;
+    memcpy(v->desc.background, v->splats.background, sizeof v->desc.background);
     return GSF_OK;
 }
 

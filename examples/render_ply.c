@@ -81,6 +81,7 @@ static gsf_result render_one(gsf_context* ctx, gsf_rasterizer* rasterizer, const
     gsf_render_output out = {0};
     gsf_render_desc desc = {0};
     desc.antialiased = splats->antialiased;
+    memcpy(desc.background, splats->background, sizeof desc.background);
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &out.color);
     if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, &desc, &out);
     if (result == GSF_OK) result = gsf_save_image(ctx, path, &out.color);
