@@ -17,6 +17,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     // A position of a splat far from a large origin may leave float32 when it is written in world coordinates.
     FUZZ_CHECK(gsf_splat_parse(&ctx, "again.ply", text.data, text.size, &again) == GSF_OK);
     FUZZ_CHECK(again.count <= splats.count && again.sh_degree == splats.sh_degree);
+    for (int c = 0; c < 3; c++) FUZZ_CHECK(again.background[c] == splats.background[c]);
     gsf_destroy_buffer(&ctx, &text);
     gsf_splat_destroy(&ctx, &again);
     gsf_splat_destroy(&ctx, &splats);

@@ -192,6 +192,7 @@ static void test_settings(gsf_context* ctx, host* h) {
     const gsf_fix_desc alone = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_BALANCED);
     CHECK(alone.train.iterations == 1200 && alone.train.dropout == 0.1f && alone.train.opacity_decay == 0.002f);
     CHECK(alone.train.depth_smoothness == 0.5f && alone.skip_psnr == 45.0f && !alone.train.lazy_adam);
+    CHECK(alone.train.background_kind == GSF_BACKGROUND_PHOTOS);
     CHECK(!alone.points && alone.train.render.near_plane == 0.0f);
     const gsf_fix_desc fast = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_FAST);
     CHECK(fast.skip_psnr == 36.0f && fast.max_pixels == 320 * 240 && fast.train.lazy_adam);

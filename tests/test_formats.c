@@ -364,6 +364,40 @@ static void test_round_trips(void) {
             }
 }
 
+// A .ply file keeps the background, as a comment. Other comments, however similar, mean nothing.
+static void test_background(void) {
+    static const char* const comments[] = {"comment background 0.25 0.5 0.75", "comment background", "comment background 1 2",
+                                           "comment background 1 1 1 1", "comment background 1 x 1", "comment background nan 0 0",
+                                           "comment background 1 1 1e30", "comment backgrounds 1 1 1", "obj_info background 1 1 1"};
+    counter count;
+    gsf_context ctx = make_context(&count, 0);
+    gsf_splats s = random_splats(&ctx, 5, 1, 2.0, 7), again;
+    const float colors[2][3] = {{0.1f, 0.0f, 1.0f}, {0.0f, 0.0f, 0.0f}};
+    for (int i = 0; i < 2; i++) {
+        gsf_buffer text = {0};
+        memcpy(s.background, colors[i], sizeof s.background);
+        CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.ply", &s, NULL, &text));
+        CHECK((memcmp(text.data + 36, "comment background ", 19) == 0) == (i == 0)); // after "ply" and the format
+        if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "x.ply", text.data, text.size, &again))) {
+            CHECK(again.count == 5 && memcmp(again.background, colors[i], sizeof again.background) == 0);
+            gsf_splat_destroy(&ctx, &again);
+        }
+        for (size_t c = 0; c < sizeof comments / sizeof *comments && i == 1; c++) {
+            gsf_buffer other = {0};
+            gsf_append_text(&ctx, &other, "%.36s%s\n", text.data, comments[c]);
+            gsf_append_bytes(&ctx, &other, text.data + 36, text.size - 36);
+            if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "x.ply", other.data, other.size, &again))) {
+                CHECK(again.background[0] == (c == 0 ? 0.25f : 0.0f) && again.background[2] == (c == 0 ? 0.75f : 0.0f));
+                gsf_splat_destroy(&ctx, &again);
+            }
+            gsf_destroy_buffer(&ctx, &other);
+        }
+        gsf_destroy_buffer(&ctx, &text);
+    }
+    gsf_splat_destroy(&ctx, &s);
+    CHECK(count.live == 0 && warnings == 0);
+}
+
 // The file does not depend on the order of chunks or the worker that runs them.
 static void test_workers(void) {
     counter count, odd_count;
@@ -972,6 +1006,7 @@ int main(void) {
     test_official();
     test_official_4();
     test_round_trips();
+    test_background();
     test_workers();
     test_not_finite();
     test_extent();

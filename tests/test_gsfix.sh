@@ -49,7 +49,7 @@ expect 2 "$gsfix" fix "$scene" --out x --compare --restorer none
 for color in red 1,1 0,0,2 1,1,1,1 nan,0,0 ,0,0; do expect 2 "$gsfix" fix "$scene" --out x --background=$color; done
 expect 2 "$gsfix" fix "$scene" --out x --photo-masks maybe
 expect 2 "$gsfix" render x.ply --out x
-expect 2 "$gsfix" render x.ply --scene "$scene" --out x --background random
+for color in random photos; do expect 2 "$gsfix" render x.ply --scene "$scene" --out x --background $color; done
 expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" metrics a b --models m
 expect 2 "$gsfix" metrics a b --which lpips_vgg
@@ -165,13 +165,15 @@ holds "masks/frame_001.png" stderr
 printf x > cut/masks/frame_001.png
 expect 1 "$gsfix" fix cut --out cut_on --restart "${plain[@]}"
 holds "masks/frame_001.png" stderr
-for color in white random 0.25,0.5,1; do
+for color in white random photos 0.25,0.5,1; do
     expect 0 "$gsfix" fix "$scene" --out colored --restart "${plain[@]}" --background $color --json
 done
 holds '"background":\[0.25,0.5,1\]' stdout
 expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_white --background white
-expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_black
-if cmp -s on_white/frame_001.png on_black/frame_001.png; then fail "the background changes nothing"; fi
+expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_its_own # kept by the file
+if cmp -s on_white/frame_001.png on_its_own/frame_001.png; then fail "the background changes nothing"; fi
+expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_given --background 0.25,0.5,1
+cmp on_given/frame_001.png on_its_own/frame_001.png || fail "the splats' background is lost"
 
 # --compare: the metrics without repair equal those of a run without repair, the others those of a run without --compare
 expect 0 "$gsfix" fix "$scene" --out compared "${small[@]}" --restorer warp --compare --seed 3

@@ -841,6 +841,48 @@ static void test_masked_training(gsf_context* ctx, const scene* s) {
     for (int run = 0; run < 3; run++) gsf_splat_destroy(ctx, &made[run]);
 }
 
+// The photos' mean colour, by their weights, is the background of trainer, renders and trained splats; of random ones the
+// given colour is.
+static void test_background(gsf_context* ctx, const scene* s) {
+    enum { PIXELS = WIDTH * HEIGHT };
+    static float shown[3 * PIXELS], weight[PIXELS];
+    static const gsf_background kinds[] = {GSF_BACKGROUND_GIVEN, GSF_BACKGROUND_PHOTOS, GSF_BACKGROUND_RANDOM};
+    static const float given[3] = {0.25f, 0.5f, 0.75f};
+    gsf_train_view views[2] = {s->views[0], s->views[1]};
+    double mean[3] = {0}, total = PIXELS;
+    views[1].weight = gsf_wrap_image(weight, GSF_F32, WIDTH, HEIGHT, 1);
+    for (int i = 0; i < PIXELS; i++) {
+        weight[i] = (float)(i % 3) * 0.5f;
+        total += (double)weight[i];
+        for (int c = 0; c < 3; c++)
+            mean[c] += (double)s->pixels[0][3 * i + c] + (double)weight[i] * (double)s->pixels[1][3 * i + c];
+    }
+    gsf_camera away = make_camera(3.1415926, 0.0, WIDTH, HEIGHT); // behind the splats, looking away
+    away.w2c[14] = -20.0;
+    for (int k = 0; k < 3; k++) {
+        gsf_trainer* trainer;
+        gsf_train_desc desc = {0};
+        gsf_splats made;
+        gsf_render_output out = {0};
+        desc.iterations = 30;
+        desc.background_kind = kinds[k];
+        memcpy(desc.background, given, sizeof given);
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, 2, &s->start, &trainer))) return;
+        for (int i = 0; i < 3; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL));
+        CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &made));
+        out.color = gsf_wrap_image(shown, GSF_F32, WIDTH, HEIGHT, 3);
+        CHECK_OK(ctx, gsf_splat_render_trainer(ctx, trainer, &away, &out));
+        const gsf_train_desc used = gsf_splat_get_trainer_desc(trainer);
+        for (int c = 0; c < 3; c++) {
+            const double expected = kinds[k] == GSF_BACKGROUND_PHOTOS ? mean[c] / total : (double)given[c];
+            CHECK_NEAR(used.background[c], expected, 1e-6);
+            CHECK(made.background[c] == used.background[c] && shown[c] == used.background[c]);
+        }
+        gsf_splat_destroy(ctx, &made);
+        gsf_splat_destroy_trainer(ctx, trainer);
+    }
+}
+
 static void destroy_scene(gsf_context* ctx, scene* s) {
     gsf_splat_destroy(ctx, &s->truth);
     gsf_splat_destroy(ctx, &s->start);
@@ -1910,6 +1952,7 @@ int main(void) {
     test_learns(&ctx, &s);
     test_mcmc_learns(&ctx, &s);
     test_masked_training(&ctx, &s);
+    test_background(&ctx, &s);
     test_candidates(&ctx, &s);
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
