@@ -492,8 +492,8 @@ typedef struct gsf_train_view {
 
 typedef enum gsf_background { // the colour behind the splats in training
     GSF_BACKGROUND_GIVEN,     // `background`
-    GSF_BACKGROUND_PHOTOS,    // the mean colour of the photos, by their weights, which then is `background`. Whatever no
-                              // photo shows is then least wrong
+    GSF_BACKGROUND_PHOTOS,    // the grey that is as bright as the photos are in the mean, by their weights; it then is
+                              // `background`. What no photo shows is less wrong than with black
     GSF_BACKGROUND_RANDOM     // a new random colour in each step; other renders show `background`
 } gsf_background;
 
@@ -11672,21 +11672,20 @@ static void gsf__trainer_prepare_lazy(const gsf_context* ctx, gsf_trainer* train
                       gsf__trainer_bands(trainer, trainer->iteration));
 }
 
-// The mean colour of the photos, by their weights; black if all weights are 0.
-static void gsf__photo_set_mean(const gsf__photo_set* set, float out[3]) {
-    double sum[3] = {0.0, 0.0, 0.0}, total = 0.0;
+// The grey of the photos' mean over pixels, by their weights, and channels; black if all weights are 0. Not the mean colour:
+// splats that may be half transparent before a backdrop of their own hue explain the photos with worse geometry.
+static float gsf__photo_set_grey(const gsf__photo_set* set) {
+    double sum = 0.0, total = 0.0;
     for (size_t p = 0; p < set->count; p++) {
         const gsf__target* t = &set->photos[p].target;
         for (size_t i = 0; i < (size_t)t->width * (size_t)t->height; i++) {
             const double w = t->weight ? (double)t->weight[i] : 1.0;
-            total += w;
-            for (size_t c = 0; c < 3; c++) sum[c] += w * (t->u8 ? (double)t->u8[3 * i + c] / 255.0 : (double)t->f32[3 * i + c]);
+            total += 3.0 * w;
+            for (size_t c = 0; c < 3; c++) sum += w * (t->u8 ? (double)t->u8[3 * i + c] / 255.0 : (double)t->f32[3 * i + c]);
         }
     }
-    for (int c = 0; c < 3; c++) {
-        const double mean = total > 0.0 ? sum[c] / total : 0.0;
-        out[c] = (float)(mean < 0.0 ? 0.0 : mean > 1.0 ? 1.0 : mean);
-    }
+    const double mean = total > 0.0 ? sum / total : 0.0;
+    return (float)(mean < 0.0 ? 0.0 : mean > 1.0 ? 1.0 : mean);
 }
 
 static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
@@ -11696,8 +11695,10 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     if (view_count == 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no training view");
     GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", &trainer->photos));
     if (trainer->desc.coarse_until > 0) GSF__TRY(gsf__photo_set_halve(ctx, &trainer->photos, &trainer->coarse));
-    if (trainer->desc.background_kind == GSF_BACKGROUND_PHOTOS)
-        gsf__photo_set_mean(&trainer->photos, trainer->desc.background);
+    if (trainer->desc.background_kind == GSF_BACKGROUND_PHOTOS) {
+        const float grey = gsf__photo_set_grey(&trainer->photos);
+        for (int c = 0; c < 3; c++) trainer->desc.background[c] = grey;
+    }
     memcpy(trainer->desc.render.background, trainer->desc.background, sizeof trainer->desc.background);
     memcpy(trainer->view.background, trainer->desc.background, sizeof trainer->view.background);
     GSF__TRY(gsf__trainer_take_splats(ctx, trainer, initial));

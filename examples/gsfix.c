@@ -137,8 +137,9 @@ static const option_spec option_specs[] = {
      "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
      "on nor measured, grey ones count partially (default on)"},
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
-     "background colour: black, white, R,G,B from 0 to 1 or, for fix, photos (their mean colour, the default unless\n"
-     "--regularize is off) or random (a new one in each step); by default, render takes that of SPLATS.ply, or else black"},
+     "background colour: black, white, R,G,B from 0 to 1 or, for fix, photos (a grey as bright as they are, the\n"
+     "default unless --regularize is off) or random (a new one in each step); by default, render takes that of SPLATS.ply,\n"
+     "or else black"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset evaluate", "go on with what an interrupted run has left in OUT"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",

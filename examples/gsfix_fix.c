@@ -435,7 +435,6 @@ static void write_switches(fix_run* run) {
     gsf_buffer* t = &run->switches;
     const gsfix_options* o = &run->app->o;
     static const char* const kinds[] = {"reference", "ellipse", "interpolate", "spread"};
-    static const char* const backgrounds[] = {"given", "photos", "random"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     gsfix_setup used = run->setup;
     used.fix = gsf_splat_get_fixer_desc(run->fixer);
@@ -464,10 +463,13 @@ static void write_switches(fix_run* run) {
     }
     gsfix_json_number(ctx, t, "extent", as_written(train->extent));
     gsfix_json_number(ctx, t, "near_plane", as_written(train->render.near_plane));
-    gsfix_json_begin(ctx, t, "background", '[');
-    for (int c = 0; c < 3; c++) gsfix_json_number(ctx, t, NULL, as_written(train->background[c]));
-    gsfix_json_end(ctx, t, ']');
-    gsfix_json_text(ctx, t, "background_kind", backgrounds[train->background_kind]);
+    if (train->background_kind == GSF_BACKGROUND_GIVEN) {
+        gsfix_json_begin(ctx, t, "background", '[');
+        for (int c = 0; c < 3; c++) gsfix_json_number(ctx, t, NULL, as_written(train->background[c]));
+        gsfix_json_end(ctx, t, ']');
+    } else { // of photos that have changed, --resume names the photo, not their grey
+        gsfix_json_text(ctx, t, "background", train->background_kind == GSF_BACKGROUND_PHOTOS ? "photos" : "random");
+    }
     gsfix_json_text(ctx, t, "photo_masks", o->photo_masks ? o->photo_masks : "on");
     gsfix_json_number(ctx, t, "photos_masked", (double)masked_photos(run));
     gsfix_json_text(ctx, t, "views", o->views ? o->views : "all");

@@ -7,6 +7,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 enum { ORBIT_COUNT = 8, ORBIT_WIDTH = 640, ORBIT_HEIGHT = 480 };
 

@@ -841,7 +841,7 @@ static void test_masked_training(gsf_context* ctx, const scene* s) {
     for (int run = 0; run < 3; run++) gsf_splat_destroy(ctx, &made[run]);
 }
 
-// The photos' mean colour, by their weights, is the background of trainer, renders and trained splats; of random ones the
+// The grey of the photos' mean, by their weights, is the background of trainer, renders and trained splats; of random ones the
 // given colour is.
 static void test_background(gsf_context* ctx, const scene* s) {
     enum { PIXELS = WIDTH * HEIGHT };
@@ -849,13 +849,13 @@ static void test_background(gsf_context* ctx, const scene* s) {
     static const gsf_background kinds[] = {GSF_BACKGROUND_GIVEN, GSF_BACKGROUND_PHOTOS, GSF_BACKGROUND_RANDOM};
     static const float given[3] = {0.25f, 0.5f, 0.75f};
     gsf_train_view views[2] = {s->views[0], s->views[1]};
-    double mean[3] = {0}, total = PIXELS;
+    double sum = 0.0, total = 3.0 * PIXELS;
     views[1].weight = gsf_wrap_image(weight, GSF_F32, WIDTH, HEIGHT, 1);
     for (int i = 0; i < PIXELS; i++) {
         weight[i] = (float)(i % 3) * 0.5f;
-        total += (double)weight[i];
+        total += 3.0 * (double)weight[i];
         for (int c = 0; c < 3; c++)
-            mean[c] += (double)s->pixels[0][3 * i + c] + (double)weight[i] * (double)s->pixels[1][3 * i + c];
+            sum += (double)s->pixels[0][3 * i + c] + (double)weight[i] * (double)s->pixels[1][3 * i + c];
     }
     gsf_camera away = make_camera(3.1415926, 0.0, WIDTH, HEIGHT); // behind the splats, looking away
     away.w2c[14] = -20.0;
@@ -874,7 +874,7 @@ static void test_background(gsf_context* ctx, const scene* s) {
         CHECK_OK(ctx, gsf_splat_render_trainer(ctx, trainer, &away, &out));
         const gsf_train_desc used = gsf_splat_get_trainer_desc(trainer);
         for (int c = 0; c < 3; c++) {
-            const double expected = kinds[k] == GSF_BACKGROUND_PHOTOS ? mean[c] / total : (double)given[c];
+            const double expected = kinds[k] == GSF_BACKGROUND_PHOTOS ? sum / total : (double)given[c];
             CHECK_NEAR(used.background[c], expected, 1e-6);
             CHECK(made.background[c] == used.background[c] && shown[c] == used.background[c]);
         }
