@@ -560,7 +560,7 @@ static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_buffer chunks = {0}, history = {0};
     const double begin = gsfix_now();
-    const size_t room = run->checkpoint_bytes + run->checkpoint_bytes / 8; // usually enough to avoid reallocation
+    const size_t room = 2 * run->checkpoint_bytes; // never moved, then; what is not touched takes no memory
     chunks.data = room ? (char*)gsf_alloc(ctx, room, 1) : NULL;
     chunks.capacity = chunks.data ? room : 0;
     write_history(run, &history);
