@@ -505,8 +505,7 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
     // unless needs_carried, and if the host cannot tell. Frames are carried when they are asked for, so ask once.
     gsf_result (*carry_fn)(void* carry_user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out);
     void* carry_user;
-    float background[3];              // what shows in `color` behind the splats, by 1 - alpha
-} gsf_restore_window;                 // struct_size may end before carry_fn or background, which then are not there
+} gsf_restore_window;                 // struct_size may end before carry_fn, which is then not there
 
 // One restorer serves one loop at a time: its state belongs to one run, from begin_fn to end_fn.
 typedef struct gsf_restorer {
@@ -1138,7 +1137,7 @@ typedef gsf_result (*gsf__carry_fn)(void* carry_user, gsf_context* ctx, int32_t 
 
 // The window's carry_fn; NULL also if an older host's window ends before it.
 GSF__SHARED gsf__carry_fn gsf__carry_fn_of(const gsf_restore_window* window) {
-    return window->struct_size >= offsetof(gsf_restore_window, background) ? window->carry_fn : NULL;
+    return window->struct_size >= sizeof *window ? window->carry_fn : NULL;
 }
 
 // Result for the errno of a failed gsf__open_path. A path below a regular file (ENOTDIR) does not exist either.
@@ -5611,7 +5610,7 @@ GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restor
         !window->out_confidence)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "clip: no frames, or struct_size is missing");
     memset(&complete, 0, sizeof complete);
-    memcpy(&complete, window, window->struct_size < sizeof complete ? window->struct_size : sizeof complete);
+    memcpy(&complete, window, window->struct_size < sizeof complete ? (size_t)GSF__WINDOW_BYTES : sizeof complete);
     complete.struct_size = sizeof complete;
     window = &complete;
     memset(&c, 0, sizeof c);

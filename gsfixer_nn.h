@@ -15282,9 +15282,8 @@ static int gsf__mini_is_packed(const gsf_image* image, int64_t width, int64_t he
            (channels == 1 || image->stride_c == (int64_t)sizeof(float)) && image->stride_y % (int64_t)sizeof(float) == 0;
 }
 
-// The planes of a frame, see gsf__mini_input, over black instead of its background.
-GSF__SHARED void gsf__mini_plane_frame(const gsf_image* color, const gsf_image* alpha, const gsf_image* depth,
-                                       const float background[3], float* out) {
+// The planes of a frame, see gsf__mini_input.
+GSF__SHARED void gsf__mini_plane_frame(const gsf_image* color, const gsf_image* alpha, const gsf_image* depth, float* out) {
     const int64_t w = color->width, h = color->height;
     double sum = 0.0, count = 0.0;
     for (int64_t y = 0; y < h; y++)
@@ -15298,9 +15297,8 @@ GSF__SHARED void gsf__mini_plane_frame(const gsf_image* color, const gsf_image* 
     for (int64_t y = 0; y < h; y++)
         for (int64_t x = 0; x < w; x++, out += GSF__MINI_FRAME) {
             const float z = gsf__mini_row(depth, y)[x];
+            for (int c = 0; c < 3; c++) out[c] = gsf__mini_clamp(gsf__mini_row(color, y)[3 * x + c], 0.0f, 1.0f);
             out[3] = gsf__mini_clamp(gsf__mini_row(alpha, y)[x], 0.0f, 1.0f);
-            for (int c = 0; c < 3; c++)
-                out[c] = gsf__mini_clamp(gsf__mini_row(color, y)[3 * x + c] - (1.0f - out[3]) * background[c], 0.0f, 1.0f);
             out[4] = z > 0.0f ? gsf__mini_clamp(unit / z, 0.0f, 1.0f) : 0.0f;
         }
 }
@@ -15424,8 +15422,6 @@ static gsf_result gsf__mini_restore_frame(gsf_context* ctx, gsf__mini_restorer* 
                                           gsf__carry_fn carry, int32_t frame) {
     const gsf_image *color = window->color + frame, *depth = window->depth + frame, *alpha = window->alpha + frame;
     const int64_t w = color->width, h = color->height, pixels = w * h;
-    static const float black[3] = {0.0f, 0.0f, 0.0f};
-    const float* background = window->struct_size >= sizeof *window ? window->background : black;
     gsf__mini_input input;
     if (!gsf__mini_is_packed(color, w, h, 3) || !gsf__mini_is_packed(depth, w, h, 1) || !gsf__mini_is_packed(alpha, w, h, 1) ||
         window->out_color[frame].width != w || window->out_color[frame].height != h ||
@@ -15433,7 +15429,7 @@ static gsf_result gsf__mini_restore_frame(gsf_context* ctx, gsf__mini_restorer* 
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "mini: frame %d lacks an f32 image of its size", (int)frame);
     GSF__TRY(gsf__mini_fit(ctx, r, w, h));
     float* shown = r->planes + pixels * GSF__MINI_FRAME;
-    gsf__mini_plane_frame(color, alpha, depth, background, r->planes);
+    gsf__mini_plane_frame(color, alpha, depth, r->planes);
     for (int32_t k = 0; k < r->desc.references; k++) {
         gsf_carried carried;
         memset(&carried, 0, sizeof carried);

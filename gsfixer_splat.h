@@ -14209,7 +14209,7 @@ static gsf_result gsf__keep_window(gsf_context* ctx, gsf_fixer* f, const gsf_res
     return GSF_OK;
 }
 
-// Lends the carrier to a window of frames at these cameras, with this depth; tells the background.
+// Lends the carrier to a window of frames at these cameras, with this depth.
 static void gsf__lend_carrier(gsf_fixer* f, gsf_restore_window* window, const gsf_image* depth) {
     f->loan.carrier = &f->carrier;
     f->loan.frame_count = window->frame_count;
@@ -14218,7 +14218,6 @@ static void gsf__lend_carrier(gsf_fixer* f, gsf_restore_window* window, const gs
     f->loan.depth = depth;
     window->carry_fn = f->limits.needs_carried > 0 ? gsf__carry_for_window : NULL;
     window->carry_user = &f->loan;
-    memcpy(window->background, f->trainer->desc.background, sizeof window->background);
 }
 
 static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {

@@ -101,7 +101,7 @@ static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore
     double hidden = 0.0, all = 0.0;
     uint8_t* out = p->bytes + p->count * (size_t)pixels * DATA_PIXEL;
     gsf_result result = probe_truth(ctx, p, w->cameras + frame, truth, true_depth, planes);
-    gsf__mini_plane_frame(w->color + frame, w->alpha + frame, depth, w->background, planes);
+    gsf__mini_plane_frame(w->color + frame, w->alpha + frame, depth, planes);
     for (int64_t i = 0; i < pixels; i++) {
         for (int k = 0; k < GSF__MINI_FRAME; k++) out[i * DATA_PIXEL + k] = data_byte(planes[i * GSF__MINI_FRAME + k], 0);
         memcpy(out + i * DATA_PIXEL + GSF__MINI_FRAME, truth + 3 * i, 3);
