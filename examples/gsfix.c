@@ -828,6 +828,7 @@ static int depth_is_png(const gsfix_app* app) { return app->o.depth_as && strcmp
 // Scene units per step of 16-bit depth, the same for all pictures: the farthest splat of any camera fits. 1, 2 or 5 times a
 // power of ten.
 static double depth_step(const gsf_splats* s, const gsf_camera* cameras, size_t stride, size_t count) {
+    static const double digits[3] = {1.0, 2.0, 5.0};
     double most = 0.0, step = 1e-9;
     for (size_t i = 0; i < count; i++) {
         const double* m = ((const gsf_camera*)((const char*)cameras + i * stride))->w2c;
@@ -837,7 +838,11 @@ static double depth_step(const gsf_splats* s, const gsf_camera* cameras, size_t 
             if (z > most) most = z;
         }
     }
-    for (int i = 1; step * 65535.0 < most && i < 60; i++) step *= i % 3 == 2 ? 2.5 : 2.0; // 1, 2, 5, 10
+    for (int i = -26; step * 65535.0 < most && i < 90; i++) { // the nearest doubles to 2e-9, 5e-9, 1e-8 ...
+        const int power = (i + 99) / 3 - 33;
+        const double digit = digits[(i + 99) % 3];
+        step = power < 0 ? digit / pow(10.0, -power) : digit * pow(10.0, power);
+    }
     return step;
 }
 
@@ -1118,13 +1123,12 @@ static gsf_result write_path(gsfix_app* app, int frames, int windows) {
     gsf_traj_path_info layout = {0};
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
     if (result != GSF_OK) return result;
-    const gsfix_path base = gsfix_absolute(app->o.out);
-    const char* file = strrchr(base.s, '/') ? strrchr(base.s, '/') + 1 : base.s;
+    const char* file = strrchr(app->o.out, '/') ? strrchr(app->o.out, '/') + 1 : app->o.out;
     const int colmap = strcmp(file, "images.txt") == 0, others = colmap || strcmp(file, "transforms.json") == 0;
-    const int folder = (int)(strlen(base.s) - strlen(file));
+    const int folder = (int)(file - app->o.out);
     result = gsfix_claim_file(app, app->o.out);
-    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*scameras.txt", folder, base.s).s);
-    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*spoints3D.txt", folder, base.s).s);
+    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*scameras.txt", folder, app->o.out).s);
+    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*spoints3D.txt", folder, app->o.out).s);
     if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
     if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &cameras);
     desc.kind = gsfix_path_kind(app->o.kind);
