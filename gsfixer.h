@@ -366,10 +366,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_decode_image(gsf_context* ctx, const char* 
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
-// Writes by extension: .png (u8 in sRGB, from any dtype and color space), .jpg (the same, quality 95) and, with
-// GSF_USE_OIIO, .exr (f16 or else f32), .tif (dtype kept, f16 as f32) and u16 images as 16-bit .png.
+// Writes by extension: .png (u16 as 16 bits, else u8; in sRGB, from any color space), .jpg (u8 in sRGB, quality 95), .exr (f16
+// or else f32, linear; uncompressed without GSF_USE_OIIO) and, with GSF_USE_OIIO, .tif (dtype kept, f16 as f32).
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
-// PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
+// The file in memory (reports embed them). `extension` is ".png", ".jpg" or ".exr".
 GSF_API GSF_NODISCARD gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension,
                                                   gsf_buffer* out);
 
@@ -428,8 +428,11 @@ GSF_API int32_t gsf_project_point(const gsf_camera* camera, const double point[3
 // The same view at another image size; intrinsics are scaled separately in width and height.
 GSF_API gsf_camera gsf_resize_camera(const gsf_camera* camera, int32_t width, int32_t height);
 
-// JSON list of cameras ({"cameras":[{"name","w2c":[16 numbers, row-major],"fx","fy","cx","cy","width","height"}]}),
-// the format of `gsfix path`, `gsfix render --path` and a restorer job's cameras.json. Names may be NULL.
+// By the name of the file: transforms.json (nerfstudio; photos are images/NAME), images.txt (COLMAP text, with cameras.txt and
+// an empty points3D.txt beside it), or else, with any name, a JSON list of cameras
+// ({"cameras":[{"name","w2c":[16 numbers, row-major],"fx","fy","cx","cy","width","height"}]}),
+// the format of `gsfix path`, `gsfix render --path` and a restorer job's cameras.json. Names may be NULL; in the first two
+// formats they are then 00000.png, 00001.png ...
 GSF_API GSF_NODISCARD gsf_result gsf_save_cameras(gsf_context* ctx, const char* path, const gsf_camera* cameras,
                                                   const char* const* names, size_t count);
 // *cameras is freed with gsf_free.
@@ -4428,7 +4431,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
     return result;
 }
 
-// ---- PNG encoder, 8 bits per channel
+// ---- PNG encoder, 8 or 16 bits per channel
 
 static int gsf__paeth(int left, int up, int corner) {
     const int estimate = left + up - corner;
@@ -4456,7 +4459,7 @@ static uint64_t gsf__png_filter(int filter, const unsigned char* row, const unsi
 
 // Filters all rows; the number of its filter precedes each. `room`: scratch for two rows.
 static void gsf__png_filter_rows(const gsf_image* image, unsigned char* room, unsigned char* out) {
-    const size_t size = (size_t)image->stride_y, step = (size_t)image->channels;
+    const size_t size = (size_t)image->stride_y, step = (size_t)image->stride_x;
     unsigned char *zeros = room, *tried = room + size;
     memset(zeros, 0, size);
     for (int64_t y = 0; y < image->height; y++, out += size + 1) {
@@ -4496,7 +4499,7 @@ static void gsf__png_close(gsf_context* ctx, gsf_buffer* out, size_t begin) {
     gsf_append_bytes(ctx, out, sum, sizeof sum);
 }
 
-// Appends a PNG file. `image`: u8, packed, 1 to 4 channels.
+// Appends a PNG file. `image`: packed, 1 to 4 channels; u8, or u16 with the bytes of each value in PNG's order.
 static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_buffer* out) {
     static const char kinds[5] = {0, 0, 4, 2, 6}; // PNG colour type by channel count
     char head[33] = "\x89PNG\r\n\x1a\n\0\0\0\0IHDR", sum[4];
@@ -4507,7 +4510,7 @@ static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_
     size_t begin = out->size + 8;
     gsf__store_be32(head + 16, (uint32_t)image->width);
     gsf__store_be32(head + 20, (uint32_t)image->height);
-    head[24] = 8;
+    head[24] = image->dtype == GSF_U16 ? 16 : 8;
     head[25] = kinds[image->channels];
     gsf_append_bytes(ctx, out, head, 8 + 8 + 13);
     gsf__png_close(ctx, out, begin);
@@ -4540,27 +4543,114 @@ static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf
 #endif
 }
 
+static void gsf__swap_u16(gsf_image* packed) { // to big-endian
+    uint16_t* values = (uint16_t*)packed->data;
+    const int64_t count = packed->width * packed->height * packed->channels;
+    for (int64_t i = 0; i < count; i++) {
+        unsigned char bytes[2];
+        bytes[0] = (unsigned char)(values[i] >> 8);
+        bytes[1] = (unsigned char)(values[i] & 255);
+        memcpy(values + i, bytes, 2);
+    }
+}
+
+static void gsf__exr_attribute(gsf_context* ctx, gsf_buffer* out, const char* name, const char* type, const void* data,
+                               size_t size) {
+    unsigned char length[4];
+    gsf__store_le(length, size, 4);
+    gsf_append_bytes(ctx, out, name, strlen(name) + 1);
+    gsf_append_bytes(ctx, out, type, strlen(type) + 1);
+    gsf_append_bytes(ctx, out, (const char*)length, 4);
+    gsf_append_bytes(ctx, out, (const char*)data, size);
+}
+
+/* Appends an OpenEXR file of uncompressed scan lines. `image`: f16 or f32, packed, 1, 3 or 4 channels. Little-endian:
+       magic 76 2f 31 01 | version 2 | attributes: name 0 type 0 size32 data | 0 | offset64 of each line |
+       lines: y32 size32, then all values of one channel after another, channels sorted by name */
+static gsf_result gsf__exr_append(gsf_context* ctx, const gsf_image* image, gsf_buffer* out) {
+    static const char* const names[5] = {"", "Y", "", "BGR", "ABGR"};
+    const char* name = names[image->channels];
+    const size_t channels = (size_t)image->channels, size = image->dtype == GSF_F16 ? 2 : 4, begin = out->size;
+    const size_t width = (size_t)image->width, height = (size_t)image->height, line = 8 + width * channels * size;
+    unsigned char list[4 * 18 + 1], window[16], zeros[8], one[4];
+    memset(list, 0, sizeof list);
+    memset(window, 0, sizeof window);
+    memset(zeros, 0, sizeof zeros);
+    for (size_t c = 0; c < channels; c++) { // name 0 | 0 uint, 1 half, 2 float | linear | sampling in x and y
+        list[18 * c] = (unsigned char)name[c];
+        list[18 * c + 2] = size == 2 ? 1 : 2;
+        list[18 * c + 10] = list[18 * c + 14] = 1;
+    }
+    gsf__store_le(window + 8, width - 1, 4);
+    gsf__store_le(window + 12, height - 1, 4);
+    gsf__store_le(one, 0x3f800000u, 4); // 1.0f
+    gsf_append_bytes(ctx, out, "\x76\x2f\x31\x01\x02\0\0\0", 8);
+    gsf__exr_attribute(ctx, out, "channels", "chlist", list, 18 * channels + 1);
+    gsf__exr_attribute(ctx, out, "compression", "compression", zeros, 1);
+    gsf__exr_attribute(ctx, out, "dataWindow", "box2i", window, 16);
+    gsf__exr_attribute(ctx, out, "displayWindow", "box2i", window, 16);
+    gsf__exr_attribute(ctx, out, "lineOrder", "lineOrder", zeros, 1);
+    gsf__exr_attribute(ctx, out, "pixelAspectRatio", "float", one, 4);
+    gsf__exr_attribute(ctx, out, "screenWindowCenter", "v2f", zeros, 8);
+    gsf__exr_attribute(ctx, out, "screenWindowWidth", "float", one, 4);
+    gsf_append_bytes(ctx, out, "", 1);
+    const size_t table = out->size - begin + 8 * height;
+    for (size_t y = 0; y < height; y++) {
+        unsigned char offset[8];
+        gsf__store_le(offset, table + y * line, 8);
+        gsf_append_bytes(ctx, out, (const char*)offset, 8);
+    }
+    unsigned char* row = (unsigned char*)gsf_alloc(ctx, line, 1);
+    if (!row) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t y = 0; y < height; y++) {
+        const unsigned char* pixels = (const unsigned char*)image->data + y * (size_t)image->stride_y;
+        gsf__store_le(row, y, 4);
+        gsf__store_le(row + 4, line - 8, 4);
+        for (size_t c = 0; c < channels; c++) {
+            const size_t at = (channels - 1 - c) * size; // the names are those of the channels in reverse
+            for (size_t x = 0; x < width; x++) {
+                uint32_t bits = 0;
+                uint16_t half = 0;
+                if (size == 2) memcpy(&half, pixels + x * channels * size + at, 2);
+                else memcpy(&bits, pixels + x * channels * size + at, 4);
+                gsf__store_le(row + 8 + (c * width + x) * size, size == 2 ? half : bits, (int)size);
+            }
+        }
+        gsf_append_bytes(ctx, out, (const char*)row, line);
+    }
+    gsf_free(ctx, row);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
 // Appends the encoded file to `out`, which is unchanged on error.
 static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gsf_image* image, const char* extension,
                                     gsf_buffer* out) {
     GSF__TRY(gsf__check_image(ctx, name, image));
-    const int png = strcmp(extension, ".png") == 0;
-    if (!png && strcmp(extension, ".jpg") != 0 && strcmp(extension, ".jpeg") != 0)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes .png and .jpg, not \"%s\"", name, extension);
-    const int32_t channels = !png && image->channels == 4 ? 3 : image->channels;
+    const int png = strcmp(extension, ".png") == 0, exr = strcmp(extension, ".exr") == 0;
+    if (!png && !exr && strcmp(extension, ".jpg") != 0 && strcmp(extension, ".jpeg") != 0)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes .png, .jpg and .exr, not \"%s\"", name, extension);
+    const int32_t channels = !png && !exr && image->channels == 4 ? 3 : image->channels;
+    const gsf_dtype dtype = exr && image->dtype == GSF_F16   ? GSF_F16
+                            : exr                            ? GSF_F32
+                            : png && image->dtype == GSF_U16 ? GSF_U16
+                                                             : GSF_U8;
     if (channels > 4 || (!png && channels == 2))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %d channels do not fit %s", name, (int)image->channels,
                         extension);
-    const int64_t longest = png ? 1 << 24 : 65535;
+    const int64_t longest = png || exr ? 1 << 24 : 65535;
     if (image->width > longest || image->height > longest || image->width * image->height > (1 << 30) / (channels + 1))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld x %lld pixels are too many for %s", name,
                         (long long)image->width, (long long)image->height, extension);
     const size_t before = out->size;
     gsf_image packed;
-    GSF__TRY(gsf_make_image(ctx, GSF_U8, image->width, image->height, channels, &packed));
+    GSF__TRY(gsf_make_image(ctx, dtype, image->width, image->height, channels, &packed));
+    if (exr) packed.color_space = GSF_COLOR_LINEAR;
     gsf_result result = gsf_convert_image(ctx, image, &packed);
+    if (result == GSF_OK && dtype == GSF_U16) gsf__swap_u16(&packed);
     if (result == GSF_OK)
-        result = png ? gsf__png_append(ctx, name, &packed, out) : gsf__jpeg_append(ctx, name, &packed, out);
+        result = exr   ? gsf__exr_append(ctx, &packed, out)
+                 : png ? gsf__png_append(ctx, name, &packed, out)
+                       : gsf__jpeg_append(ctx, name, &packed, out);
     if (result != GSF_OK) out->size = before;
     gsf_destroy_image(ctx, &packed);
     return result;
@@ -5277,20 +5367,139 @@ GSF_API gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera) 
     return GSF_OK;
 }
 
+static void gsf__append_values(gsf_context* ctx, gsf_buffer* text, const double* values, size_t count, const char* between) {
+    for (size_t i = 0; i < count; i++) {
+        if (i) gsf_append_text(ctx, text, "%s", between);
+        gsf_append_json_number(ctx, text, values[i]);
+    }
+}
+
+static gsf_result gsf__write_text(gsf_context* ctx, const char* path, gsf_buffer* text) { // and frees it
+    const gsf_result result = text->failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, text->data, text->size);
+    gsf_destroy_buffer(ctx, text);
+    return result;
+}
+
+static void gsf__camera_file(const char* const* names, size_t i, char out[512]) {
+    if (names && names[i]) snprintf(out, 512, "%s", names[i]);
+    else snprintf(out, 512, "%05zu.png", i);
+}
+
+// Each frame has its own intrinsics. The matrix is row by row; OpenGL's axes are y up and z backward.
+static gsf_result gsf__save_transforms(gsf_context* ctx, const char* path, const gsf_camera* cameras, const char* const* names,
+                                       size_t count) {
+    gsf_buffer text;
+    memset(&text, 0, sizeof text);
+    gsf_append_text(ctx, &text, "{\"camera_model\":\"PINHOLE\",\"frames\":[");
+    for (size_t i = 0; i < count; i++) {
+        const gsf_camera* c = cameras + i;
+        const double values[4] = {c->fx, c->fy, c->cx, c->cy};
+        static const char* const keys[4] = {"fl_x", "fl_y", "cx", "cy"};
+        double c2w[16], row[4];
+        char name[512], file[540];
+        gsf_get_camera_c2w(c, c2w);
+        gsf__camera_file(names, i, name);
+        snprintf(file, sizeof file, "images/%s", name);
+        gsf_append_text(ctx, &text, "%s\n{\"file_path\":", i ? "," : "");
+        gsf_append_json_string(ctx, &text, file);
+        gsf_append_text(ctx, &text, ",\"w\":%d,\"h\":%d", (int)c->width, (int)c->height);
+        for (int k = 0; k < 4; k++) {
+            gsf_append_text(ctx, &text, ",\"%s\":", keys[k]);
+            gsf_append_json_number(ctx, &text, values[k]);
+        }
+        gsf_append_text(ctx, &text, ",\"transform_matrix\":[");
+        for (int r = 0; r < 4; r++) {
+            for (int k = 0; k < 4; k++) row[k] = k == 1 || k == 2 ? 0.0 - c2w[4 * k + r] : c2w[4 * k + r];
+            gsf_append_text(ctx, &text, r ? ",[" : "[");
+            gsf__append_values(ctx, &text, row, 4, ",");
+            gsf_append_text(ctx, &text, "]");
+        }
+        gsf_append_text(ctx, &text, "]}");
+    }
+    gsf_append_text(ctx, &text, "\n]}\n");
+    return gsf__write_text(ctx, path, &text);
+}
+
+// w x y z of the rotation of a rigid w2c, by the largest of the four squares, which loses no digits.
+static void gsf__camera_quaternion(const double m[16], double q[4]) {
+    const double trace[4] = {m[0] + m[5] + m[10], m[0] - m[5] - m[10], m[5] - m[0] - m[10], m[10] - m[0] - m[5]};
+    const double off[3][2] = {{m[6] - m[9], m[6] + m[9]}, {m[8] - m[2], m[8] + m[2]}, {m[1] - m[4], m[1] + m[4]}};
+    int best = 0;
+    for (int k = 1; k < 4; k++)
+        if (trace[k] > trace[best]) best = k;
+    const double root = sqrt(1.0 + trace[best]), scale = 0.5 / root;
+    q[best] = 0.5 * root;
+    if (best == 0)
+        for (int k = 0; k < 3; k++) q[1 + k] = off[k][0] * scale;
+    else
+        for (int k = 0; k < 3; k++) // products of x y z: those of the pair without k
+            q[k == best - 1 ? 0 : 1 + k] = off[k == best - 1 ? k : 3 - k - (best - 1)][k != best - 1] * scale;
+}
+
+// `path` is that of images.txt. An image has two lines, of which the second, its points, is empty.
+static gsf_result gsf__save_colmap_text(gsf_context* ctx, const char* path, const gsf_camera* cameras, const char* const* names,
+                                        size_t count) {
+    const size_t length = strlen(path) - strlen("images.txt");
+    char* beside = (char*)gsf_alloc(ctx, length + 16, 1);
+    gsf_buffer list, images, points;
+    memset(&list, 0, sizeof list);
+    memset(&images, 0, sizeof images);
+    memset(&points, 0, sizeof points);
+    if (!beside) return GSF_ERROR_OUT_OF_MEMORY;
+    memcpy(beside, path, length);
+    gsf_append_text(ctx, &list, "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n");
+    gsf_append_text(ctx, &images, "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points\n");
+    gsf_append_text(ctx, &points, "# POINT3D_ID X Y Z R G B ERROR TRACK\n");
+    for (size_t i = 0, id = 0; i < count; i++) {
+        const gsf_camera* c = cameras + i;
+        double values[7];
+        char name[512];
+        if (!i || c->width != c[-1].width || c->height != c[-1].height || c->fx != c[-1].fx || c->fy != c[-1].fy ||
+            c->cx != c[-1].cx || c->cy != c[-1].cy) { // another camera than before
+            values[0] = c->fx, values[1] = c->fy, values[2] = c->cx, values[3] = c->cy;
+            gsf_append_text(ctx, &list, "%zu PINHOLE %d %d ", ++id, (int)c->width, (int)c->height);
+            gsf__append_values(ctx, &list, values, 4, " ");
+            gsf_append_text(ctx, &list, "\n");
+        }
+        gsf__camera_quaternion(c->w2c, values);
+        memcpy(values + 4, c->w2c + 12, 3 * sizeof(double));
+        gsf__camera_file(names, i, name);
+        gsf_append_text(ctx, &images, "%zu ", i + 1);
+        gsf__append_values(ctx, &images, values, 7, " ");
+        gsf_append_text(ctx, &images, " %zu %s\n\n", id, name);
+    }
+    memcpy(beside + length, "cameras.txt", 12);
+    gsf_result result = gsf__write_text(ctx, beside, &list);
+    memcpy(beside + length, "points3D.txt", 13);
+    if (result == GSF_OK) result = gsf__write_text(ctx, beside, &points);
+    if (result == GSF_OK) result = gsf__write_text(ctx, path, &images);
+    gsf_destroy_buffer(ctx, &points);
+    gsf_destroy_buffer(ctx, &images);
+    gsf_free(ctx, beside);
+    return result;
+}
+
+static int gsf__is_named(const char* path, const char* name) { // by its last part
+    const size_t length = strlen(path), size = strlen(name);
+    return length >= size && strcmp(path + length - size, name) == 0 &&
+           (length == size || path[length - size - 1] == '/' || path[length - size - 1] == '\\');
+}
+
 GSF_API gsf_result gsf_save_cameras(gsf_context* ctx, const char* path, const gsf_camera* cameras,
                                     const char* const* names, size_t count) {
     static const char* const keys[4] = {"fx", "fy", "cx", "cy"};
     gsf_buffer text;
     memset(&text, 0, sizeof text);
     gsf_result result = GSF_OK;
-    gsf_append_text(ctx, &text, "{\"cameras\":[");
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
+        result = gsf_check_camera(ctx, &cameras[i]);
+        if (result != GSF_OK) return gsf_fail(ctx, result, "%s: camera %zu: %s", path, i, ctx->error);
+    }
+    if (gsf__is_named(path, "transforms.json")) return gsf__save_transforms(ctx, path, cameras, names, count);
+    if (gsf__is_named(path, "images.txt")) return gsf__save_colmap_text(ctx, path, cameras, names, count);
+    gsf_append_text(ctx, &text, "{\"cameras\":[");
+    for (size_t i = 0; i < count; i++) {
         const gsf_camera* camera = &cameras[i];
-        result = gsf_check_camera(ctx, camera);
-        if (result != GSF_OK) {
-            (void)gsf_fail(ctx, result, "%s: camera %zu: %s", path, i, ctx->error);
-            break;
-        }
         gsf_append_text(ctx, &text, "%s\n{", i ? "," : "");
         if (names && names[i]) {
             gsf_append_text(ctx, &text, "\"name\":");

@@ -32,7 +32,9 @@ typedef struct option_spec {
 #define ALL "info fix render view convert filter path restore metrics masks dataset evaluate"
 static const option_spec option_specs[] = {
     {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render convert filter path restore masks dataset evaluate",
-     "output folder (convert, path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
+     "output folder (convert, path: output file), different from the inputs. Only files written by gsfix are ever replaced.\n"
+     "path: transforms.json is written as nerfstudio's, images.txt as COLMAP's text, with cameras.txt and points3D.txt beside\n"
+     "it; their photos are the pictures of `gsfix render --path`, in images/"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix view filter path masks info render",
      "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
      "per line)"},
@@ -176,6 +178,9 @@ static const option_spec option_specs[] = {
      "render: render the cameras in this file"},
     {"--depth", FLAG, AT(depth), 0, 0, NULL, "render",
      "also write OUT/depth/NAME.npy (float32, scene units) and a colour-mapped image of it"},
+    {"--depth-as", TEXT, AT(depth_as), 0, 0, "exr|png16", "render",
+     "with --depth: also write OUT/depth/NAME.exr (float32, scene units), or OUT/depth16/NAME.png, 16-bit numbers that the\n"
+     "factor in OUT/depth16/scale.json turns into scene units; 0 where there is nothing"},
     {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also write OUT/alpha/NAME.png"},
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
      "keep the points that a training view sees by ray (embree), by track (tracks) or by either (both, the default)"},
@@ -249,16 +254,41 @@ static int has_word(const char* words, const char* word) { // words: separated b
     return 0;
 }
 
+static const char* built_with(int is) { return is ? "yes" : "no"; }
+
 static void print_version(void) {
     gsf_context ctx = {0};
+    int embree = 0, openmp = 0, sdl = 0, zstd = 0, stb = 1;
     if (gsf_init_context(&ctx) != GSF_OK) return;
 #ifdef GSF_USE_EMBREE
-    const char* rays = "Embree";
-#else
-    const char* rays = "z-buffer (built without Embree)";
+    embree = 1;
+#endif
+#ifdef _OPENMP
+    openmp = 1;
+#endif
+#ifdef GSFIX_USE_SDL2
+    sdl = 1;
+#endif
+#ifdef GSF_USE_ZSTD
+    zstd = 1;
+#endif
+#ifdef GSF_NO_STB
+    stb = 0;
 #endif
     printf("gsfix %s  kernels: %s  workers: %d  visibility: %s\n", GSF_VERSION, gsf_describe_cpu_level(ctx.cpu_level),
-           ctx.parallel.worker_count, rays);
+           ctx.parallel.worker_count, embree ? "Embree" : "z-buffer (built without Embree)");
+    // OpenImageIO is for hosts in C++, and this program is C.
+    printf("built with  Embree: %s  OpenMP: %s  SDL2 (view): %s  zstd (SPZ 4): %s  stb (PNG, JPEG): %s  OpenImageIO: no\n",
+           built_with(embree), built_with(openmp), built_with(sdl), built_with(zstd), built_with(stb));
+#if defined(GSF_NO_SIMD)
+    printf("instruction sets  scalar\n");
+#elif defined(__x86_64__) || defined(_M_X64)
+    printf("instruction sets  scalar, avx2, avx512, avx512_vnni, avx512_bf16; chosen by the processor at start\n");
+#elif defined(__aarch64__) || defined(__wasm_simd128__)
+    printf("instruction sets  scalar, simd128\n");
+#else
+    printf("instruction sets  scalar\n");
+#endif
 }
 
 static int print_overview(FILE* to) {
@@ -798,6 +828,43 @@ static int run_info(gsfix_app* app) {
 
 // ---- render ----------------------------------------------------------------------
 
+static int depth_is_exr(const gsfix_app* app) { return app->o.depth_as && strcmp(app->o.depth_as, "exr") == 0; }
+static int depth_is_png(const gsfix_app* app) { return app->o.depth_as && strcmp(app->o.depth_as, "png16") == 0; }
+
+// Scene units per step of 16-bit depth, the same for all pictures: the farthest splat of any camera fits. 1, 2 or 5 times a
+// power of ten.
+static double depth_step(const gsf_splats* s, const gsf_camera* cameras, size_t stride, size_t count) {
+    static const double digits[3] = {1.0, 2.0, 5.0};
+    double most = 0.0, step = 1e-9;
+    for (size_t i = 0; i < count; i++) {
+        const double* m = ((const gsf_camera*)((const char*)cameras + i * stride))->w2c;
+        for (size_t k = 0; k < s->count; k++) {
+            double z = m[14];
+            for (size_t a = 0; a < 3; a++) z += m[4 * a + 2] * (s->origin[a] + (double)s->means[3 * k + a]);
+            if (z > most) most = z;
+        }
+    }
+    for (int i = -26; step * 65535.0 < most && i < 90; i++) { // the nearest doubles to 2e-9, 5e-9, 1e-8 ...
+        const int power = (i + 99) / 3 - 33;
+        const double digit = digits[(i + 99) % 3];
+        step = power < 0 ? digit / pow(10.0, -power) : digit * pow(10.0, power);
+    }
+    return step;
+}
+
+static gsf_result save_depth_16(gsfix_app* app, const gsf_image* depth, const char* name) {
+    gsf_image steps;
+    gsf_result result = gsf_make_image(&app->ctx, GSF_U16, depth->width, depth->height, 1, &steps);
+    if (result != GSF_OK) return result;
+    for (int64_t i = 0; i < depth->width * depth->height; i++) {
+        const double value = floor((double)((const float*)depth->data)[i] / app->depth_step + 0.5);
+        ((uint16_t*)steps.data)[i] = (uint16_t)(value < 0.0 ? 0.0 : value > 65535.0 ? 65535.0 : value);
+    }
+    result = gsf_save_image(&app->ctx, gsfix_pathf("%s/depth16/%s.png", app->o.out, name).s, &steps);
+    gsf_destroy_image(&app->ctx, &steps);
+    return result;
+}
+
 // Writes one image (and depth, alpha) to the output folders; buffers grow to the size of the largest camera.
 static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const gsf_splats* splats, const gsf_camera* camera,
                              const gsf_render_desc* desc, const char* name) {
@@ -816,6 +883,10 @@ static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const g
         result = gsfix_save_npy(ctx, gsfix_pathf("%s/depth/%s.npy", out, name).s, &images.depth);
         if (result == GSF_OK) result = gsfix_color_depth(ctx, &images.depth, &picture);
         if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/depth/%s.png", out, name).s, &picture);
+        images.depth.color_space = GSF_COLOR_LINEAR; // numbers, which EXR keeps
+        if (result == GSF_OK && depth_is_exr(app))
+            result = gsf_save_image(ctx, gsfix_pathf("%s/depth/%s.exr", out, name).s, &images.depth);
+        if (result == GSF_OK && depth_is_png(app)) result = save_depth_16(app, &images.depth, name);
     }
     if (result == GSF_OK && app->o.alpha)
         result = gsf_save_image(ctx, gsfix_pathf("%s/alpha/%s.png", out, name).s, &images.alpha);
@@ -837,10 +908,25 @@ static gsf_result open_render_out(gsfix_app* app, const gsf_scene* scene, size_t
         result = gsfix_claim(app, "%s.png", name.s);
         if (result == GSF_OK && app->o.depth) result = gsfix_claim(app, "depth/%s.npy", name.s);
         if (result == GSF_OK && app->o.depth) result = gsfix_claim(app, "depth/%s.png", name.s);
+        if (result == GSF_OK && depth_is_exr(app)) result = gsfix_claim(app, "depth/%s.exr", name.s);
+        if (result == GSF_OK && depth_is_png(app)) result = gsfix_claim(app, "depth16/%s.png", name.s);
         if (result == GSF_OK && app->o.alpha) result = gsfix_claim(app, "alpha/%s.png", name.s);
     }
+    if (result == GSF_OK && depth_is_png(app)) result = gsfix_claim(app, "depth16/scale.json");
     if (result == GSF_OK) result = gsfix_open_out(app);
     return result == GSF_OK ? gsfix_remove_stale(app) : result;
+}
+
+static gsf_result save_depth_step(gsfix_app* app) {
+    gsf_buffer text = {0};
+    gsf_append_text(&app->ctx, &text, "{\"units_per_step\":");
+    gsf_append_json_number(&app->ctx, &text, app->depth_step);
+    gsf_append_text(&app->ctx, &text, "}\n");
+    const gsf_result result =
+        text.failed ? GSF_ERROR_OUT_OF_MEMORY
+                    : gsf_write_file(&app->ctx, gsfix_pathf("%s/depth16/scale.json", app->o.out).s, text.data, text.size);
+    gsf_destroy_buffer(&app->ctx, &text);
+    return result;
 }
 
 // A fixer that trains nothing, with the training views of the scene as references and a restorer.
@@ -908,6 +994,11 @@ static gsf_result render_all(gsfix_app* app, const float* background) { // NULL:
                                                                       scene.view_count)
                                        : gsf_splat_measure_near_plane(path, sizeof *path, count);
     if (result == GSF_OK) result = open_render_out(app, app->o.path ? NULL : &scene, count);
+    if (result == GSF_OK && depth_is_png(app) && count) {
+        app->depth_step = app->o.path ? depth_step(&splats, path, sizeof *path, count)
+                                      : depth_step(&splats, &scene.views[0].camera, sizeof scene.views[0], count);
+        result = save_depth_step(app);
+    }
     if (result == GSF_OK && filtered) result = open_filter(app, &scene, &splats, &desc, &filter);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
     gsfix_json_begin(ctx, &app->json, "frames", '[');
@@ -942,6 +1033,9 @@ static int run_render(gsfix_app* app) {
         return gsfix_misused(app, "--restorer %s: render takes none|warp|mini[:FILE]", r);
     if (filtered && !app->o.scene) return gsfix_misused(app, "--restorer: needs the photos of a --scene");
     if (!filtered && !app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
+    if (app->o.depth_as && !depth_is_exr(app) && !depth_is_png(app))
+        return gsfix_misused(app, "--depth-as %s: one of exr and png16", app->o.depth_as);
+    if (app->o.depth_as && !app->o.depth) return gsfix_misused(app, "--depth-as: only with --depth");
     const char* text = app->o.background;
     float background[3];
     gsf_background kind;
@@ -1036,7 +1130,12 @@ static gsf_result write_path(gsfix_app* app, int frames, int windows) {
     gsf_traj_path_info layout = {0};
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
     if (result != GSF_OK) return result;
+    const char* file = strrchr(app->o.out, '/') ? strrchr(app->o.out, '/') + 1 : app->o.out;
+    const int colmap = strcmp(file, "images.txt") == 0, others = colmap || strcmp(file, "transforms.json") == 0;
+    const int folder = (int)(file - app->o.out);
     result = gsfix_claim_file(app, app->o.out);
+    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*scameras.txt", folder, app->o.out).s);
+    if (result == GSF_OK && colmap) result = gsfix_claim_file(app, gsfix_pathf("%.*spoints3D.txt", folder, app->o.out).s);
     if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
     if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &cameras);
     desc.kind = gsfix_path_kind(app->o.kind);
@@ -1060,7 +1159,8 @@ static gsf_result write_path(gsfix_app* app, int frames, int windows) {
             names[i] = scene.views[split.train[reference[i]]].name;
             photos++;
         }
-    if (result == GSF_OK) result = gsf_save_cameras(ctx, app->o.out, path, names, layout.frame_count);
+    // In other programs' formats the names are those of `gsfix render --path`.
+    if (result == GSF_OK) result = gsf_save_cameras(ctx, app->o.out, path, others ? NULL : names, layout.frame_count);
     if (result == GSF_OK) {
         gsfix_json_text(ctx, &app->json, "kind", app->o.kind ? app->o.kind : "reference");
         gsfix_json_number(ctx, &app->json, "frames", (double)layout.frame_count);

@@ -16,7 +16,7 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
+    const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
@@ -54,6 +54,7 @@ typedef struct gsfix_app {
     const struct gsfix_crew* crew; // does the tasks of gsfix_run_tasks; NULL: this process, one after the other
     gsfix_clip_stage stages[GSFIX_CLIP_STAGES];
     int stage_count;
+    double depth_step; // of --depth-as png16: scene units
 } gsfix_app;
 
 // ---- gsfix_util.c --------------------------------------------------------------

@@ -17,6 +17,8 @@ int gsfix_run_view(gsfix_app* app) {
 #include <SDL.h>
 #include <math.h>
 
+#include "gsfix_orbit.h"
+
 enum { VIEW_COLOR, VIEW_DEPTH, VIEW_ALPHA, VIEW_ERROR, VIEW_REPAIRED, VIEW_MODES };
 
 static const char* const view_names[VIEW_MODES] = {"color", "depth", "opacity", "error", "repaired"};
@@ -44,8 +46,7 @@ typedef struct viewer {
     gsf_train_stats last; // of the last training step
     gsf_image repaired; // a frame of the last window, copied
     // where from
-    gsf_camera camera;
-    double c2w[16], pivot[3], up[3];
+    gsfix_orbit at;
     size_t photo;  // of the training views, SIZE_MAX: the camera is at none
     int mode, paused, quit, stale; // stale: the picture is older than camera, mode or splats
     int moving;                    // while a button or key is down, slow pictures have half the resolution
@@ -58,56 +59,19 @@ typedef struct viewer {
 
 // ---- camera ----------------------------------------------------------------------
 
-static double* view_axis(viewer* v, int axis) { return v->c2w + 4 * axis; } // right, down, forward; 3: position
-
-static void view_rotate(const double axis[3], double angle, double x[3]) { // Rodrigues
-    const double c = cos(angle), s = sin(angle), along = (axis[0] * x[0] + axis[1] * x[1] + axis[2] * x[2]) * (1.0 - c);
-    const double cross[3] = {axis[1] * x[2] - axis[2] * x[1], axis[2] * x[0] - axis[0] * x[2], axis[0] * x[1] - axis[1] * x[0]};
-    for (int k = 0; k < 3; k++) x[k] = x[k] * c + cross[k] * s + axis[k] * along;
-}
-
 static void view_moved(viewer* v) {
-    gsf_set_camera_c2w(&v->camera, v->c2w);
     v->photo = SIZE_MAX;
     v->stale = 1;
     if (v->mode == VIEW_ERROR) v->mode = VIEW_COLOR;
 }
 
-static void view_turn(viewer* v, const double axis[3], double angle) { // about the pivot
-    double arm[3];
-    for (int k = 0; k < 3; k++) arm[k] = view_axis(v, 3)[k] - v->pivot[k];
-    view_rotate(axis, angle, arm);
-    for (int k = 0; k < 3; k++) view_axis(v, 3)[k] = v->pivot[k] + arm[k];
-    for (int a = 0; a < 3; a++) view_rotate(axis, angle, view_axis(v, a));
-    view_moved(v);
-}
-
 static void view_shift(viewer* v, int axis, double distance, int with_pivot) {
-    for (int k = 0; k < 3; k++) {
-        const double step = view_axis(v, axis)[k] * distance;
-        view_axis(v, 3)[k] += step;
-        if (with_pivot) v->pivot[k] += step;
-    }
+    orbit_shift(&v->at, axis, distance, with_pivot);
     view_moved(v);
 }
 
-static double view_distance(const viewer* v) { // to the pivot
-    double sum = 0.0;
-    for (int k = 0; k < 3; k++) sum += (v->c2w[12 + k] - v->pivot[k]) * (v->c2w[12 + k] - v->pivot[k]);
-    return sqrt(sum) + 1e-9;
-}
-
-// Looks from a photo's camera, with its field of view in a window of any shape.
 static void view_from(viewer* v, const gsf_camera* from) {
-    const double scale = fmin((double)v->width / from->width, (double)v->height / from->height);
-    v->camera = *from;
-    v->camera.width = v->width;
-    v->camera.height = v->height;
-    v->camera.fx = from->fx * scale;
-    v->camera.fy = from->fy * scale;
-    v->camera.cx = v->width / 2.0 + (from->cx - from->width / 2.0) * scale;
-    v->camera.cy = v->height / 2.0 + (from->cy - from->height / 2.0) * scale;
-    gsf_get_camera_c2w(from, v->c2w);
+    orbit_from(&v->at, from, v->width, v->height);
     v->stale = 1;
 }
 
@@ -116,46 +80,15 @@ static void view_photo(viewer* v, size_t photo) {
     v->photo = photo;
 }
 
-static int view_compare(const void* a, const void* b) {
-    const float x = *(const float*)a, y = *(const float*)b;
-    return (x > y) - (x < y);
-}
-
-// The median position, and three quarters of the splats within `radius` of it along each axis.
-static gsf_result view_middle(viewer* v, double middle[3], double* radius) {
-    const gsf_splats* s = &v->splats;
-    float* values = (float*)gsf_alloc(v->ctx, s->count + 1, sizeof *values);
-    if (!values) return GSF_ERROR_OUT_OF_MEMORY;
-    *radius = 1e-3;
-    for (int k = 0; k < 3 && s->count; k++) {
-        for (size_t i = 0; i < s->count; i++) values[i] = s->means[3 * i + (size_t)k];
-        qsort(values, s->count, sizeof *values, view_compare);
-        middle[k] = s->origin[k] + (double)values[s->count / 2];
-        *radius = fmax(*radius, (double)(values[s->count * 7 / 8] - values[s->count / 8]) / 2.0);
-    }
-    gsf_free(v->ctx, values);
-    return GSF_OK;
-}
-
 // ---- what is shown ---------------------------------------------------------------
 
 static gsf_result view_open_splats(viewer* v) {
     double radius;
     gsf_result result = gsf_splat_load(v->ctx, v->app->o.inputs[0], &v->splats);
     if (result == GSF_OK && !v->splats.count) result = gsf_fail(v->ctx, GSF_ERROR_DEGENERATE, "no splats to show");
-    if (result == GSF_OK) result = view_middle(v, v->pivot, &radius);
+    if (result == GSF_OK) result = orbit_face(v->ctx, &v->at, &v->splats, v->width, v->height, &radius);
     if (result != GSF_OK) return result;
-    gsf_camera camera = {0};
-    camera.width = v->width;
-    camera.height = v->height;
-    camera.fx = camera.fy = 1.1 * v->height;
-    for (int k = 0; k < 4; k++) v->c2w[5 * k] = 1.0;
-    for (int k = 0; k < 3; k++) v->c2w[12 + k] = v->pivot[k] - (k == 2 ? 3.0 * radius : 0.0);
-    gsf_set_camera_c2w(&camera, v->c2w);
-    camera.cx = v->width / 2.0;
-    camera.cy = v->height / 2.0;
-    view_from(v, &camera);
-    v->up[1] = -1.0;
+    v->stale = 1;
     v->desc.near_plane = (float)(0.02 * radius);
     v->desc.antialiased = v->splats.antialiased;
     memcpy(v->desc.background, v->splats.background, sizeof v->desc.background);
@@ -174,18 +107,12 @@ static gsf_result view_open_scene(viewer* v, const gsfix_setup* setup) {
     if (result == GSF_OK)
         result = gsf_splat_make_initial_splats(ctx, &v->scene, v->split.train, v->split.train_count, &setup->initial,
                                                &v->splats, NULL);
-    if (result == GSF_OK) result = view_middle(v, v->pivot, &radius);
+    if (result == GSF_OK) result = orbit_set_pivot(ctx, &v->at, &v->splats, &radius);
     if (result != GSF_OK) return result;
     desc.train.render.near_plane =
         gsf_splat_measure_near_plane(&v->scene.views[0].camera, sizeof v->scene.views[0], v->scene.view_count);
     v->desc = desc.train.render;
-    for (size_t i = 0; i < v->split.train_count; i++) { // the photos' mean up
-        double c2w[16];
-        gsf_get_camera_c2w(&v->views[i].camera, c2w);
-        for (int k = 0; k < 3; k++) v->up[k] -= c2w[4 + k];
-    }
-    const double length = sqrt(v->up[0] * v->up[0] + v->up[1] * v->up[1] + v->up[2] * v->up[2]);
-    for (int k = 0; k < 3; k++) v->up[k] = length > 1e-6 ? v->up[k] / length : k == 1 ? -1.0 : 0.0;
+    orbit_set_up(&v->at, v->views, v->split.train_count);
     v->loss_every = (size_t)desc.train.iterations / 256 + 1;
     v->loss_room = (size_t)desc.train.iterations / v->loss_every + 1;
     v->losses = (float*)gsf_alloc_zeroed(ctx, v->loss_room, sizeof *v->losses);
@@ -253,7 +180,7 @@ static gsf_result view_make_error(viewer* v, gsf_image* out) {
 // Makes the picture of the current mode, u8 or f32 with 3 channels, 1 / `detail` of the window's size (or the frame's).
 static gsf_result view_make_picture(viewer* v, int detail, gsf_image* out) {
     const int width = (v->width + detail - 1) / detail, height = (v->height + detail - 1) / detail;
-    const gsf_camera camera = gsf_resize_camera(&v->camera, width, height);
+    const gsf_camera camera = gsf_resize_camera(&v->at.camera, width, height);
     gsf_render_output images = {0};
     gsf_image plane = {0};
     if (v->mode == VIEW_ERROR && v->photo != SIZE_MAX) return view_make_error(v, out);
@@ -368,7 +295,7 @@ static gsf_result view_save_next(viewer* v) { // under a name that does not exis
 // ---- events ----------------------------------------------------------------------
 
 static gsf_result view_key(viewer* v, SDL_Keycode key) {
-    const double step = 0.04 * view_distance(v);
+    const double step = 0.04 * orbit_distance(&v->at);
     if (key >= SDLK_1 && key < SDLK_1 + VIEW_MODES) {
         v->mode = (int)(key - SDLK_1);
         if (v->mode == VIEW_ERROR && v->views && v->photo == SIZE_MAX) view_photo(v, 0);
@@ -394,18 +321,17 @@ static gsf_result view_key(viewer* v, SDL_Keycode key) {
 
 static void view_drag(viewer* v, const SDL_MouseMotionEvent* m) {
     if (m->state & SDL_BUTTON_LMASK) {
-        view_turn(v, v->up, -0.006 * m->xrel);
-        const double right[3] = {v->c2w[0], v->c2w[1], v->c2w[2]};
-        view_turn(v, right, -0.006 * m->yrel);
+        orbit_drag(&v->at, m->xrel, m->yrel);
+        view_moved(v);
     } else if (m->state & (SDL_BUTTON_RMASK | SDL_BUTTON_MMASK)) {
-        const double pixel = view_distance(v) / v->camera.fx;
+        const double pixel = orbit_distance(&v->at) / v->at.camera.fx;
         view_shift(v, 0, -pixel * m->xrel, 1);
         view_shift(v, 1, -pixel * m->yrel, 1);
     }
 }
 
 static void view_resize(viewer* v) {
-    const gsf_camera before = v->camera;
+    const gsf_camera before = v->at.camera;
     SDL_GetRendererOutputSize(v->renderer, &v->width, &v->height);
     if (v->width < 16) v->width = 16;
     if (v->height < 16) v->height = 16;
@@ -420,7 +346,7 @@ static gsf_result view_events(viewer* v) {
         else if (event.type == SDL_KEYDOWN) result = view_key(v, event.key.keysym.sym);
         else if (event.type == SDL_MOUSEMOTION) view_drag(v, &event.motion);
         else if (event.type == SDL_MOUSEWHEEL)
-            view_shift(v, 2, event.wheel.y * 0.1 * view_distance(v), 0);
+            view_shift(v, 2, event.wheel.y * 0.1 * orbit_distance(&v->at), 0);
         else if (event.type == SDL_WINDOWEVENT && event.window.event == SDL_WINDOWEVENT_SIZE_CHANGED) view_resize(v);
         else if (event.type == SDL_WINDOWEVENT && event.window.event == SDL_WINDOWEVENT_EXPOSED) v->stale = 1;
     }
@@ -480,7 +406,10 @@ static gsf_result view_shoot(viewer* v) {
         gsfix_json_number(v->ctx, &v->app->json, "psnr", after);
         gsfix_print(v->app, "photos: %.2f dB before, %.2f dB after %d steps", before, after, (int)v->last.iteration);
     }
-    if (v->app->o.orbit != 0.0) view_turn(v, v->up, v->app->o.orbit * 3.14159265358979 / 180.0);
+    if (v->app->o.orbit != 0.0) {
+        orbit_turn(&v->at, v->at.up, v->app->o.orbit * 3.14159265358979 / 180.0);
+        view_moved(v);
+    }
     if (result == GSF_OK) result = view_draw(v);
     return result == GSF_OK ? view_save(v, v->app->o.screenshot) : result;
 }

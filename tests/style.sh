@@ -6,8 +6,8 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 limit=$(sed -n 's/^ColumnLimit: //p' .clang-format)
 [ -n "$limit" ] || { echo "style.sh: .clang-format has no ColumnLimit" >&2; exit 1; }
-sources=(*.h {examples,bench,tests,tests/compile}/*.[ch] tests/*.cpp)
-others=(*.md CMakeLists.txt {examples,tests}/CMakeLists.txt {examples,bench,tests,tests/compile}/*.sh bench/*.py tests/*.py)
+sources=(*.h {examples,examples/web,bench,tests,tests/compile}/*.[ch] {examples,tests}/*.cpp)
+others=(*.md CMakeLists.txt {examples,tests}/CMakeLists.txt {examples,examples/web,bench,tests,tests/compile}/*.sh bench/*.py tests/*.py examples/web/*.{py,js,html})
 status=0
 for file in "${sources[@]}" "${others[@]}"; do
     [ -e "$file" ] || continue
