@@ -97,6 +97,6 @@ expect 1 "no linear layer" "$train" none "${base[@]}" --lora 2 --targets to_x
 expect 1 "scenes.txt" "$train" none --model model --data missing
 expect 2 "usage" "$train" none --model model
 expect 0 "M parameters" "$train" --memory --model model
-expect 1 "lora_A and lora_B\|no adapter" "$gsfix" "${clip[@]}" --out x --restorer dit:model --lora whole/transformer
+expect 1 "no adapter of a linear layer" "$gsfix" "${clip[@]}" --out x --restorer dit:model --lora "whole/$weights"
 expect 2 "lora" "$gsfix" "${clip[@]}" --out x --restorer warp --lora learned
 echo "passed"
