@@ -8,20 +8,18 @@
 
    MODEL_DIR: as for gsfix fix --restorer dit:MODEL_DIR; DATASET: the DIR of gsfix dataset. Each sequence is encoded once, by
    the code that encodes clips for the restorer, to a file in OUT/cache: frames and photos (VAE), references (DINOv2, VGGT),
-   prompt
-   (T5; the caption is that of the data set or --caption, else BLIP-2's). Sequences are resampled to the model's length.
+   prompt (T5; the caption is that of the data set or --caption, else BLIP-2's). Sequences are resampled to the model's
+   length.
 
    The loss is the mean squared error of the velocity at a random time step. The paper states the learning rate, AdamW, the
    iterations, the batch and that there is a warm-up; the other defaults are this program's. --drop-references,
    --drop-prompt: probability that an example has no references, or the negative prompt. --average: decay of a moving average
-   of the weights,
-   which is then what is saved.
+   of the weights, which is then what is saved.
 
    OUT gets transformer/ in the released layout, and links to the other parts of MODEL_DIR: use it as dit:OUT. With --lora it
-   gets adapter_model.safetensors and adapter_config.json as peft writes them: dit:MODEL_DIR --lora OUT. OUT/training.state is
-   what
-   --resume continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do
-   runs with other numbers of threads. Delete OUT/cache if the weights of MODEL_DIR's encoders change.
+   gets adapter_model.safetensors and adapter_config.json as peft writes them: dit:MODEL_DIR --lora OUT. OUT/training.state
+   is what --resume continues from, written every --save-every steps; a run that was killed and resumed ends with the same
+   bytes, as do runs with other numbers of threads. Delete OUT/cache if the weights of MODEL_DIR's encoders change.
    OUT/training.loss.html shows the loss.
    --memory: only print what training needs. With -DGSF_USE_MPI, compiled by mpicc, up to --groups ranks share each batch:
        mpirun -np 2 train_restorer ...

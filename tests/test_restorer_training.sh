@@ -98,5 +98,5 @@ expect 1 "scenes.txt" "$train" none --model model --data missing
 expect 2 "usage" "$train" none --model model
 expect 0 "M parameters" "$train" --memory --model model
 expect 1 "no adapter of a linear layer" "$gsfix" "${clip[@]}" --out x --restorer dit:model --lora "whole/$weights"
-expect 2 "lora" "$gsfix" "${clip[@]}" --out x --restorer warp --lora learned
+expect 2 "--lora" "$gsfix" restore "${clip[1]}" --out x --restorer warp --lora learned
 echo "passed"
