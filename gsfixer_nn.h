@@ -574,6 +574,8 @@ typedef struct gsf_nn_dit_desc {
     gsf_nn_condition condition; // which reference tokens condition the model (the paper's ablation)
     int32_t int8;            // gsf_nn_quantize_transformer
     int32_t bf16;            // gsf_nn_transformer.bf16
+    const char* lora;        // NULL, or low-rank adapters for the transformer, as peft or train_restorer write them: a file
+                             // or its folder (adapter_model.safetensors, adapter_config.json)
     gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are set per window
 } gsf_nn_dit_desc;
 
@@ -12494,6 +12496,170 @@ GSF_API gsf_result gsf_nn_load_transformer(gsf_context* ctx, const char* folder,
     return result;
 }
 
+// ---- low-rank adapters
+
+/* LoRA (Hu et al. 2021): a linear layer of weight w (out, in) computes with w + scale b a; a: (rank, in), b: (out, rank). As
+   peft stores it, in adapter_model.safetensors, PREFIX MODULE.lora_A.weight and PREFIX MODULE.lora_B.weight belong to the
+   network's MODULE.weight. adapter_config.json beside it says lora_alpha: scale is lora_alpha / rank or, with use_rslora,
+   lora_alpha / sqrt(rank). Without that file it is 1. */
+typedef struct gsf__lora_pair { // the adapter of one layer
+    gsf_nn_tensor* weight;      // in the network
+    gsf_nn_tensor stored;       // what that was before
+    const gsf_nn_tensor *a, *b; // in the file
+    float scale;
+    float* merged;              // (out, in)
+} gsf__lora_pair;
+
+typedef struct gsf__lora { // zero it; destroy it before the network
+    gsf_nn_weights file;
+    gsf__lora_pair* pairs;
+    size_t count;
+    double alpha;          // < 0: scale is 1
+    int32_t is_stable;     // use_rslora
+} gsf__lora;
+
+typedef struct gsf__lora_job {
+    const gsf__lora_pair* pair;
+    const float *a, *b;
+} gsf__lora_job;
+
+static void gsf__lora_merge_row(void* arg, size_t row, int32_t worker) {
+    const gsf__lora_job* job = (const gsf__lora_job*)arg;
+    const gsf__lora_pair* p = job->pair;
+    const int64_t in = p->stored.shape[1], rank = p->a->shape[0];
+    float* out = p->merged + (int64_t)row * in;
+    (void)worker;
+    gsf_nn_convert_tensor(&p->stored, (int64_t)row * in, in, out);
+    for (int64_t k = 0; k < rank; k++) {
+        const float factor = p->scale * job->b[(int64_t)row * rank + k];
+        const float* a = job->a + k * in;
+        for (int64_t i = 0; i < in; i++) out[i] += factor * a[i];
+    }
+}
+
+// Makes the network compute with the adapters' present values.
+static gsf_result gsf__lora_merge(gsf_context* ctx, gsf__lora* lora) {
+    for (size_t i = 0; i < lora->count; i++) {
+        gsf__lora_pair* p = &lora->pairs[i];
+        float* values = (float*)gsf_alloc(ctx, (size_t)(p->a->count + p->b->count), sizeof *values);
+        if (!p->merged) p->merged = (float*)gsf_alloc(ctx, (size_t)p->stored.count, sizeof *p->merged);
+        if (!values || !p->merged) {
+            gsf_free(ctx, values);
+            return GSF_ERROR_OUT_OF_MEMORY;
+        }
+        gsf_nn_convert_tensor(p->a, 0, p->a->count, values);
+        gsf_nn_convert_tensor(p->b, 0, p->b->count, values + p->a->count);
+        gsf__lora_job job = {p, values, values + p->a->count};
+        gsf__parallel_for(ctx, (size_t)p->stored.shape[0], gsf__lora_merge_row, &job);
+        gsf_free(ctx, values);
+        p->weight->data = p->merged;
+        p->weight->dtype = GSF_NN_F32;
+    }
+    return GSF_OK;
+}
+
+static void gsf__lora_destroy(gsf_context* ctx, gsf__lora* lora) {
+    for (size_t i = 0; i < lora->count; i++) {
+        gsf__lora_pair* p = &lora->pairs[i];
+        if (p->merged) *p->weight = p->stored;
+        gsf_free(ctx, p->merged);
+    }
+    gsf_free(ctx, lora->pairs);
+    gsf_nn_destroy_weights(ctx, &lora->file);
+    memset(lora, 0, sizeof *lora);
+}
+
+static gsf_result gsf__lora_read_config(gsf_context* ctx, const char* path, const void* text, size_t size, gsf__lora* lora) {
+    gsf_json json;
+    GSF__TRY(gsf_parse_json(ctx, path, (const char*)text, size, &json));
+    const gsf_json_value* root = json.values;
+    const gsf_json_value *alpha = gsf_find_json_member(&json, root, "lora_alpha");
+    const gsf_json_value *stable = gsf_find_json_member(&json, root, "use_rslora");
+    const gsf_json_value *dora = gsf_find_json_member(&json, root, "use_dora");
+    const gsf_json_value *flipped = gsf_find_json_member(&json, root, "fan_in_fan_out");
+    const gsf_json_value *alphas = gsf_find_json_member(&json, root, "alpha_pattern");
+    gsf_result result = GSF_OK;
+    lora->is_stable = stable && stable->type == GSF_JSON_TRUE;
+    if (!alpha || alpha->type != GSF_JSON_NUMBER || !(alpha->number >= 0.0 && alpha->number < 1e6))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: lora_alpha is missing or no number from 0 on", path);
+    else lora->alpha = alpha->number;
+    if (!result && ((dora && dora->type == GSF_JSON_TRUE) || (flipped && flipped->type == GSF_JSON_TRUE) ||
+                    (alphas && alphas->count)))
+        result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: use_dora, fan_in_fan_out and alpha_pattern are not supported", path);
+    gsf_destroy_json(ctx, &json);
+    return result;
+}
+
+// The network's tensor that an adapter's tensor belongs to, if its name ends in `suffix`; or NULL.
+static const gsf_nn_tensor* gsf__lora_target(const gsf_nn_weights* network, const char* name, const char* suffix) {
+    static const char* const prefixes[] = {"base_model.model.", "transformer.", ""}; // of peft, of diffusers, none
+    char wanted[512];
+    if (!gsf__nn_ends_in(name, suffix)) return NULL;
+    for (size_t i = 0; i < GSF__COUNT(prefixes); i++) {
+        const size_t length = strlen(prefixes[i]), module = strlen(name) - strlen(suffix);
+        if (strncmp(name, prefixes[i], length) != 0 || module < length || module - length > sizeof wanted - 8) continue;
+        snprintf(wanted, sizeof wanted, "%.*s.weight", (int)(module - length), name + length);
+        const gsf_nn_tensor* found = gsf_nn_find_tensor(network, wanted);
+        if (found) return found;
+    }
+    return NULL;
+}
+
+static gsf_result gsf__lora_pair_up(gsf_context* ctx, gsf_nn_weights* network, gsf__lora* lora) {
+    size_t halves = 0;
+    lora->pairs = (gsf__lora_pair*)gsf_alloc_zeroed(ctx, lora->file.tensor_count + 1, sizeof *lora->pairs);
+    if (!lora->pairs) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < lora->file.tensor_count; i++) {
+        const gsf_nn_tensor* t = &lora->file.tensors[i];
+        const gsf_nn_tensor* a = gsf__lora_target(network, t->name, ".lora_A.weight");
+        const gsf_nn_tensor* weight = a ? a : gsf__lora_target(network, t->name, ".lora_B.weight");
+        if (!weight || weight->rank != 2 || t->rank != 2 || t->shape[a ? 1 : 0] != weight->shape[a ? 1 : 0])
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %s is no adapter of a linear layer of the network", lora->file.name,
+                            gsf__nn_show(t->name).text);
+        gsf__lora_pair* p = lora->pairs;
+        while (p < lora->pairs + lora->count && p->weight != weight) p++;
+        if (p == lora->pairs + lora->count) lora->count++;
+        p->weight = network->tensors + (weight - network->tensors);
+        p->stored = *weight;
+        if (a) p->a = t;
+        else p->b = t;
+        halves++;
+    }
+    for (size_t i = 0; i < lora->count; i++) {
+        gsf__lora_pair* p = &lora->pairs[i];
+        if (!p->a || !p->b || halves != 2 * lora->count || p->a->shape[0] != p->b->shape[1] || p->a->shape[0] < 1)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: lora_A and lora_B of %s do not match", lora->file.name,
+                            gsf__nn_show(p->weight->name).text);
+        const double rank = (double)p->a->shape[0];
+        p->scale = (float)(lora->alpha < 0.0 ? 1.0 : lora->alpha / (lora->is_stable ? sqrt(rank) : rank));
+    }
+    if (lora->count) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no adapters", lora->file.name);
+}
+
+// Opens adapters of a network and merges them: a folder, or a file with its configuration beside it. The merged weights are
+// float32, 4 bytes for each weight of the layers with adapters.
+static gsf_result gsf__lora_open(gsf_context* ctx, const char* path, gsf_nn_weights* network, gsf__lora* lora) {
+    gsf_buffer config;
+    void* text = NULL;
+    size_t size = 0, folder = strlen(path);
+    memset(lora, 0, sizeof *lora);
+    memset(&config, 0, sizeof config);
+    lora->alpha = -1.0;
+    if (gsf__nn_ends_in(path, ".safetensors"))
+        while (folder > 0 && path[folder - 1] != '/' && path[folder - 1] != '\\') folder--;
+    gsf_append_text(ctx, &config, "%.*s%sadapter_config.json", (int)folder, path, path[folder] || !folder ? "" : "/");
+    gsf_result result = config.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, config.data, &text, &size);
+    if (!result && text) result = gsf__lora_read_config(ctx, config.data, text, size, lora);
+    if (!result) result = gsf_nn_load_weights(ctx, path, "adapter_model", &lora->file);
+    if (!result) result = gsf__lora_pair_up(ctx, network, lora);
+    if (!result) result = gsf__lora_merge(ctx, lora);
+    gsf_free(ctx, text);
+    gsf_destroy_buffer(ctx, &config);
+    if (result) gsf__lora_destroy(ctx, lora);
+    return result;
+}
+
 // ---- forward pass
 
 typedef struct gsf__dit_run {
@@ -13790,6 +13956,7 @@ typedef struct gsf__dit_restorer {
     gsf_nn_dit_desc desc;      // strings point into `texts`
     char* texts;
     gsf_nn_transformer transformer;
+    gsf__lora lora;            // its adapters
     gsf_nn_vae vae;
     gsf_nn_schedule schedule;
     gsf__dit_kept* kept;
@@ -14678,6 +14845,7 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
                               : gsf_nn_load_schedule(ctx, path.data, &r->schedule);
         gsf_destroy_buffer(ctx, &path);
     }
+    if (!result && r->desc.lora) result = gsf__lora_open(ctx, r->desc.lora, &r->transformer.weights, &r->lora);
     if (!result) result = gsf__dit_open_conditions(ctx, r);
     r->transformer.bf16 = r->desc.bf16;
     return !result && r->desc.int8 ? gsf_nn_quantize_transformer(ctx, &r->transformer, NULL) : result;
@@ -14686,6 +14854,7 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
 static void gsf__dit_destroy(void* user, gsf_context* ctx) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
     gsf__dit_end(r, ctx);
+    gsf__lora_destroy(ctx, &r->lora);
     gsf_nn_destroy_transformer(ctx, &r->transformer);
     gsf_nn_destroy_vae(ctx, &r->vae);
     gsf_nn_destroy_schedule(ctx, &r->schedule);
@@ -14703,7 +14872,7 @@ static void gsf__dit_destroy(void* user, gsf_context* ctx) {
 static gsf_result gsf__dit_copy_desc(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf__dit_restorer* r) {
     r->desc = *desc;
     const char** const texts[] = {&r->desc.model, &r->desc.features, &r->desc.caption, &r->desc.save_features,
-                                  &r->desc.sample.checkpoint};
+                                  &r->desc.lora, &r->desc.sample.checkpoint};
     size_t size = 0;
     for (size_t i = 0; i < GSF__COUNT(texts); i++) size += *texts[i] ? strlen(*texts[i]) + 1 : 0;
     r->texts = (char*)gsf_alloc(ctx, size, 1);
@@ -19362,9 +19531,12 @@ GSF__SHARED gsf_result gsf__nn_make_params(gsf_context* ctx, gsf_nn_weights* wei
     return GSF_OK;
 }
 
-// Where to add the gradient of a tensor; NULL if there is no such tensor or it is not trained.
+// Where to add the gradient of a tensor; NULL if there is no such tensor or it is not trained, as those of the network itself
+// while its adapters are.
 static float* gsf__nn_grad_of(const gsf__nn_params* params, const gsf_nn_tensor* tensor) {
-    const int64_t at = tensor ? params->at[tensor - params->weights->tensors] : -1;
+    const uintptr_t first = (uintptr_t)params->weights->tensors, place = (uintptr_t)tensor;
+    const size_t index = tensor && place >= first ? (size_t)(place - first) / sizeof *tensor : SIZE_MAX;
+    const int64_t at = index < params->weights->tensor_count ? params->at[index] : -1;
     return at < 0 ? NULL : params->grad + at;
 }
 
@@ -19554,6 +19726,7 @@ typedef struct gsf__dit_trace { // intermediates of one block; (tokens, width) u
 typedef struct gsf__dit_train {
     gsf__dit_run run;          // of one sample
     gsf__nn_params* params;
+    const gsf__lora* lora;     // NULL, or the adapters that `params` are of
     const float *dino, *vggt;  // the sample's reference tokens, before the projection
     float* inputs;             // (layers + 1, tokens, width): x before each block and after the last
     float* references;         // (reference tokens, width)
@@ -19565,6 +19738,42 @@ typedef struct gsf__dit_train {
     float* out;                // predicted velocity, then the noisy input with control, then the true velocity
     float *wave, *time1, *time2, *hidden_time; // of the time embedding; time1, time2: before the activations
 } gsf__dit_train;
+
+// y = x (w + scale b a)^T: with u = scale x a^T, db = dy^T u; with du = scale dy b, da = du^T x
+static gsf_result gsf__dit_lora_grad(const gsf__dit_train* t, const gsf__lora_pair* p, const float* x, int64_t rows,
+                                     const float* dy) {
+    gsf_context* ctx = t->run.nn.ctx;
+    const int64_t count = rows * p->a->shape[0];
+    gsf__nn_linear_desc down;
+    gsf__nn_linear_grad_desc d;
+    float* u = (float*)gsf_alloc(ctx, (size_t)count, 2 * sizeof *u);
+    if (!u) return GSF_ERROR_OUT_OF_MEMORY;
+    float* du = u + count;
+    memset(&down, 0, sizeof down);
+    down.x = x;
+    down.rows = rows;
+    down.weight = p->a;
+    down.y = u;
+    gsf_result result = gsf__nn_run_linear(ctx, NULL, &down);
+    for (int64_t i = 0; i < count; i++) u[i] *= p->scale;
+    memset(&d, 0, sizeof d);
+    d.x = u;
+    d.rows = rows;
+    d.weight = p->b;
+    d.dy = dy;
+    d.dx = du;
+    d.dweight = gsf__nn_grad_of(t->params, p->b);
+    if (!result) result = gsf__nn_linear_grad(ctx, &d);
+    for (int64_t i = 0; i < count; i++) du[i] *= p->scale;
+    d.x = x;
+    d.weight = p->a;
+    d.dy = du;
+    d.dx = NULL;
+    d.dweight = gsf__nn_grad_of(t->params, p->a);
+    if (!result) result = gsf__nn_linear_grad(ctx, &d);
+    gsf_free(ctx, u);
+    return result;
+}
 
 static gsf_result gsf__dit_linear_grad(const gsf__dit_train* t, const gsf__nn_layer* layer, const float* x, int64_t rows,
                                        const float* dy, float* dx, int accumulate) {
@@ -19578,6 +19787,8 @@ static gsf_result gsf__dit_linear_grad(const gsf__dit_train* t, const gsf__nn_la
     d.accumulate = accumulate;
     d.dweight = gsf__nn_grad_of(t->params, layer->weight);
     d.dbias = gsf__nn_grad_of(t->params, layer->bias);
+    for (size_t i = 0; t->lora && i < t->lora->count; i++)
+        if (t->lora->pairs[i].weight == layer->weight) GSF__TRY(gsf__dit_lora_grad(t, &t->lora->pairs[i], x, rows, dy));
     return dx || d.dweight || d.dbias ? gsf__nn_linear_grad(t->run.nn.ctx, &d) : GSF_OK;
 }
 
@@ -19826,6 +20037,7 @@ typedef struct gsf__dit_train_desc {
     int32_t batch;                // examples whose losses are averaged
     const gsf__dit_example* examples;
     const gsf_nn_schedule* schedule;
+    const gsf__lora* lora;        // NULL, or the network's adapters, if `params` are theirs: call gsf__lora_merge after updates
     float* predicted;             // NULL, or (batch, frames, out_channels, height, width): for tests
 } gsf__dit_train_desc;
 
@@ -19961,6 +20173,7 @@ GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_
         in.hidden = in.references = e->latents; // until there is memory; NULL means none
         if (!e->reference_tokens) in.references = NULL;
         t.params = params;
+        t.lora = desc->lora;
         GSF__TRY(gsf__dit_check_input(ctx, c, &in));
         gsf__dit_begin_run(&t.run, ctx, c);
         gsf__dit_set_input(&t.run, &in);
@@ -19977,6 +20190,36 @@ GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_
         gsf_free(ctx, memory);
     }
     return result;
+}
+
+/* Memory of training in bytes. weights: parameters, gradients, Adam's moments and, if `average`, the moving average, all
+   float32. kept: the input of every block (checkpoints). work: one block's intermediates and gradients, with the transposes of
+   its largest layer. */
+typedef struct gsf__dit_train_cost { double weights, kept, work; } gsf__dit_train_cost;
+
+// Of `trained` parameters and one example at a time of this size. Weights that are not trained stay in the mapped files.
+GSF__SHARED gsf__dit_train_cost gsf__nn_query_training(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                       int64_t trained, int average, int32_t frames, int32_t height,
+                                                       int32_t width, int64_t reference_tokens) {
+    gsf__dit_train_cost cost;
+    gsf_nn_transformer_desc in;
+    gsf__dit_train t;
+    const float there = 0.0f; // references that only need to be there
+    memset(&t, 0, sizeof t);
+    memset(&in, 0, sizeof in);
+    in.batch = in.reference_batch = 1;
+    in.frames = frames;
+    in.height = height;
+    in.width = width;
+    in.reference_tokens = reference_tokens;
+    in.references = &there;
+    gsf__dit_begin_run(&t.run, ctx, transformer);
+    gsf__dit_set_input(&t.run, &in);
+    const double d = (double)t.run.width, tokens = (double)t.run.tokens, floats = (double)gsf__dit_lay_out_train(&t, NULL);
+    cost.weights = (average ? 20.0 : 16.0) * (double)trained;
+    cost.kept = 4.0 * ((double)transformer->layers + 1.0) * tokens * d;
+    cost.work = 4.0 * (floats + (5.0 * tokens * d > 4.0 * d * d ? 5.0 * tokens * d : 4.0 * d * d)) - cost.kept;
+    return cost;
 }
 
 // ---- training: mini

@@ -84,6 +84,8 @@ static const option_spec option_specs[] = {
      "tensors are computed by the model's encoders"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
      "dit: save the encoded photos and the prompts of all clips to a new file, for --ref-features"},
+    {"--lora", TEXT, AT(lora), 0, 0, "PATH", "fix restore",
+     "dit: low-rank adapters for its transformer, as peft or train_restorer --lora write them: a folder or its .safetensors"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore evaluate",
      "dit: the prompt, a description of the scene (default: the model captions the first frame of each clip)"},
     {"--steps", WHOLE, AT(steps), 1, 1000, "N", "fix restore evaluate",
@@ -538,6 +540,7 @@ int gsfix_check_restorer(gsfix_app* app) {
     const char* alone = o->condition                ? "--condition"
                         : o->ref_features           ? "--ref-features"
                         : o->save_features          ? "--save-features"
+                        : o->lora                   ? "--lora"
                         : o->caption                ? "--caption"
                         : o->steps                  ? "--steps"
                         : o->solver                 ? "--solver"
@@ -577,6 +580,7 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     d.model = o->restorer + 4;
     d.features = o->ref_features;
     d.save_features = o->save_features;
+    d.lora = o->lora;
     d.keep_saved = o->resume;
     d.sample.any_frames = o->any_frames;
     d.caption = o->caption;

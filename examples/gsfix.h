@@ -16,7 +16,7 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
+    const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features, *lora;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;

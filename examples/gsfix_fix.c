@@ -410,6 +410,13 @@ static size_t masked_photos(const fix_run* run) { // number of masked photos amo
     return count;
 }
 
+static gsf_result digest_adapters(fix_run* run) { // --lora FILE, or the file in a folder
+    const char* path = run->app->o.lora;
+    const size_t size = strlen(path), end = strlen(".safetensors");
+    if (size > end && strcmp(path + size - end, ".safetensors") == 0) return gsfix_digest_input(run->app, path);
+    return gsfix_digest_input(run->app, gsfix_pathf("%s/adapter_model.safetensors", path).s);
+}
+
 // All settings that affect the result, with defaults filled in: printed in metrics.json, and compared by --resume.
 static void write_dit_switches(fix_run* run) {
     const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
@@ -418,6 +425,7 @@ static void write_dit_switches(fix_run* run) {
     gsf_buffer* t = &run->switches;
     gsfix_json_text(ctx, t, "condition", gsfix_conditions[dit.condition]);
     gsfix_json_text(ctx, t, "ref_features", dit.features);
+    gsfix_json_text(ctx, t, "lora", dit.lora);
     gsfix_json_text(ctx, t, "caption", dit.caption);
     gsfix_json_number(ctx, t, "steps", d.steps);
     gsfix_json_text(ctx, t, "solver", gsfix_solvers[d.solver]);
@@ -874,6 +882,7 @@ static gsf_result prepare(fix_run* run) {
     if (result == GSF_OK && app->o.path && !run->path_count)
         result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: no cameras", app->o.path);
     if (result == GSF_OK) result = gsfix_digest_input(app, app->o.ref_features);
+    if (result == GSF_OK && app->o.lora) result = digest_adapters(run);
     if (result == GSF_OK) result = make_initial(run);
     if (result == GSF_OK) result = start_fixer(run);
     if (result != GSF_OK) return result;

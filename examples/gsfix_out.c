@@ -192,7 +192,7 @@ gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene) {
 
 static gsf_result add_options(gsfix_app* app) { // inputs named on the command line
     const gsfix_options* o = &app->o;
-    const char* const paths[] = {o->masks, o->scene, o->path, o->ref_features, o->model,
+    const char* const paths[] = {o->masks, o->scene, o->path, o->ref_features, o->lora, o->model,
                                  o->restorer && strncmp(o->restorer, "dit:", 4) == 0 ? o->restorer + 4 : NULL};
     gsf_result result = GSF_OK;
     for (int i = 0; i < o->input_count && result == GSF_OK; i++) result = gsfix_add_input(app, o->inputs[i]);

@@ -14,10 +14,11 @@ typedef struct mini_sample { float *frame, *shown, *truth; } mini_sample; // of 
 typedef struct mini_batch {
     const gsf_nn_tensor* const* scenes; // "frames" of each
     size_t scene_count;
-    int64_t crop, count, step;
+    int64_t crop, count, step;          // count: samples of a batch
+    size_t first;                       // the sample of the batch that samples[0] is
     uint64_t seed;
     int plain;                          // no augmentation
-    mini_sample* samples;               // (count)
+    mini_sample* samples;               // of a part of the batch
 } mini_batch;
 
 typedef struct tone_curve {
@@ -130,9 +131,10 @@ static void better_pixel(float part, mini_sample s, int64_t at, int64_t pixels) 
         for (int c = 3; c < 6; c++) s.shown[(r * pixels + at) * GSF__MINI_REFERENCE + c] *= part;
 }
 
-static void make_sample(void* arg, size_t sample, int32_t worker) {
+static void make_sample(void* arg, size_t index, int32_t worker) {
     const mini_batch* b = (const mini_batch*)arg;
-    const mini_sample s = b->samples[sample];
+    const mini_sample s = b->samples[index];
+    const size_t sample = b->first + index;
     const gsf_nn_tensor* t = b->scenes[(size_t)((double)b->scene_count * draw_of(b, sample, 0))];
     const int64_t height = t->shape[1], width = t->shape[2], crop = b->crop, pixels = crop * crop;
     const int64_t frame = (int64_t)((double)t->shape[0] * draw_of(b, sample, 1));

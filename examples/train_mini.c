@@ -4,13 +4,16 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
-           [--pixels 216] [--fit 599]
+           [--pixels 216] [--fit 599] [--groups 1]
 
    DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
    the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume
    continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs
    with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
-   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. */
+   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. --groups N: the batch is added
+   up in N parts (training.h), which up to N ranks share: with -DGSF_USE_MPI, compiled by mpicc,
+       mpirun -np 2 train_mini ... --groups 2
+   writes the bytes of the same command on one rank. OUT.loss.csv and OUT.loss.html: loss of every step, and its curve. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L
 #endif
@@ -21,13 +24,14 @@
 
 #include "mini_data.h"
 #include "mini_batches.h"
+#include "training.h"
 
 typedef struct seeds { uint64_t first, last; } seeds;
 
 typedef struct options {
     const char *out, *data, *init;
     seeds scenes, check;
-    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit;
+    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit, groups;
     uint64_t seed;
     double rate;
 } options;
@@ -43,10 +47,12 @@ typedef struct training {
     gsf__mini_run run;
     mini_batch batch;
     gsf__mini_input* inputs;
-    float *planes, *truth;       // of all samples of a batch
+    float *planes, *truth;       // of all samples of a group
+    training_ranks ranks;
+    training_sum sum;
+    training_log log;
 } training;
 
-static double cpu_minutes(void) { return (double)clock() / CLOCKS_PER_SEC / 60.0; }
 static double decibels(double square) { return -10.0 * log10(square > 1e-10 ? square : 1e-10); }
 
 // ---- data ------------------------------------------------------------------------
@@ -58,11 +64,11 @@ static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
     gsf_nn_weights* file = t->files + index;
     snprintf(path, sizeof path, "%s/%llu.safetensors", t->o.data, (unsigned long long)seed);
     struct stat there;
-    if (stat(path, &there) != 0) {
+    if (stat(path, &there) != 0 && t->ranks.rank == 0) {
         const data_desc desc = {t->o.data, t->o.pixels, t->o.fit};
         const gsf_result made = make_data(&t->ctx, &desc, seed, path);
         if (made != GSF_OK) return made;
-        fprintf(stderr, "train_mini: scene %llu, %.1f CPU minutes\n", (unsigned long long)seed, cpu_minutes());
+        fprintf(stderr, "train_mini: scene %llu, %.1f CPU minutes\n", (unsigned long long)seed, training_cpu_minutes());
     }
     const gsf_result result = gsf_nn_load_weights(&t->ctx, path, NULL, file);
     if (result != GSF_OK) return result;
@@ -93,7 +99,7 @@ static gsf_result open_data(training* t) {
 
 // A new network, or that of --init; its weights and the optimiser's state are those of OUT.state if the run continues.
 static gsf_result open_network(training* t) {
-    char first[2048], state[2048];
+    char first[TRAINING_PATH], state[TRAINING_PATH];
     gsf__mini sizes;
     memset(&sizes, 0, sizeof sizes);
     sizes.hidden = 32;
@@ -102,18 +108,19 @@ static gsf_result open_network(training* t) {
         sizes.width[l] = l ? 48 : 32;
         sizes.blocks[l] = l > 1 ? 2 : 1;
     }
-    snprintf(first, sizeof first, "%s.first", t->o.out);
+    snprintf(first, sizeof first, "%s.first%d", t->o.out, t->ranks.rank);
     snprintf(state, sizeof state, "%s.state", t->o.out);
     gsf_result result = t->o.init ? GSF_OK : gsf__mini_make(&t->ctx, &sizes, t->o.seed, first);
     if (result == GSF_OK) result = gsf__mini_open(&t->ctx, t->o.init ? t->o.init : first, NULL, 0, &t->net);
     if (result == GSF_OK) result = gsf__nn_make_params(&t->ctx, &t->net.weights, NULL, 1, &t->params);
     if (result == GSF_OK && t->o.resume) result = gsf__nn_load_params(&t->ctx, &t->params, state);
     if (!t->o.init) remove(first);
+    if (result == GSF_OK && t->params.step) result = training_load_log(&t->ctx, t->o.out, t->params.step, &t->log);
     return result;
 }
 
 static gsf_result make_batches(training* t) {
-    const size_t pixels = (size_t)(t->o.crop * t->o.crop), count = (size_t)t->o.batch;
+    const size_t pixels = (size_t)(t->o.crop * t->o.crop), count = (size_t)(t->o.batch / t->o.groups);
     const size_t planes = GSF__MINI_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE;
     t->planes = (float*)gsf_alloc(&t->ctx, count * pixels, planes * sizeof(float));
     t->truth = (float*)gsf_alloc(&t->ctx, count * pixels, 3 * sizeof(float));
@@ -132,12 +139,16 @@ static gsf_result make_batches(training* t) {
     t->batch.crop = t->o.crop;
     t->batch.count = t->o.batch;
     t->batch.seed = t->o.seed;
-    return gsf__mini_begin(&t->ctx, &t->net, t->o.batch, DATA_REFERENCES, t->o.crop, t->o.crop, 1, &t->run);
+    const gsf_result result = training_begin_sum(&t->ctx, t->ranks, t->o.groups, t->params.count, &t->sum);
+    if (result != GSF_OK) return result;
+    return gsf__mini_begin(&t->ctx, &t->net, t->o.batch / t->o.groups, DATA_REFERENCES, t->o.crop, t->o.crop, 1, &t->run);
 }
 
 static gsf_result save_state(training* t) {
-    char path[2048];
+    char path[TRAINING_PATH];
+    const gsf_result result = training_save_log(&t->ctx, t->o.out, "train_mini", &t->log);
     snprintf(path, sizeof path, "%s.state", t->o.out);
+    if (result != GSF_OK) return result;
     return gsf__nn_save_params(&t->ctx, &t->params, GSF__NN_SAVE_STATE, path);
 }
 
@@ -159,6 +170,35 @@ static gsf_result save_network(training* t) {
     return result;
 }
 
+static void add_loss(gsf__mini_loss* sum, const gsf__mini_loss* loss, double share) {
+    sum->relative += share * loss->relative;
+    sum->square += share * loss->square;
+    sum->before += share * loss->before;
+    sum->likelihood += share * loss->likelihood;
+    sum->fault += share * loss->fault;
+}
+
+// The gradients of a batch, in t->params; loss: of the rank's part of it.
+static gsf_result train_batch(training* t, gsf__mini_loss* loss, double* total) {
+    gsf_result result = GSF_OK;
+    memset(loss, 0, sizeof *loss);
+    t->batch.step = t->params.step;
+    for (int g = 0; g < t->sum.own && result == GSF_OK; g++) {
+        gsf__mini_loss part;
+        const size_t each = (size_t)(t->o.batch / t->o.groups);
+        t->batch.first = (size_t)(t->ranks.rank * t->sum.own + g) * each;
+        t->ctx.parallel.for_fn(t->ctx.parallel.user, each, make_sample, &t->batch);
+        result = gsf__mini_forward(&t->run, t->inputs);
+        if (result == GSF_OK) result = gsf__mini_measure_loss(&t->run, t->truth, &part);
+        if (result == GSF_OK) result = gsf__mini_backward(&t->run, &t->params);
+        if (result != GSF_OK) break;
+        add_loss(loss, &part, 1.0 / t->sum.own);
+        training_add_group(&t->sum, g, part.total, t->params.grad);
+    }
+    if (result == GSF_OK) *total = training_add_ranks(&t->sum, t->params.grad) / t->o.groups;
+    return result;
+}
+
 static gsf_result train(training* t) {
     gsf__nn_adam_desc adam;
     gsf__mini_loss sum;
@@ -171,25 +211,22 @@ static gsf_result train(training* t) {
     adam.max_norm = 1.0;
     adam.warmup = t->o.steps < 200 ? t->o.steps / 2 : 100;
     adam.steps = t->o.steps;
+    adam.batches = t->o.groups;
     gsf_result result = GSF_OK;
     while (t->params.step < t->o.steps && result == GSF_OK) {
         const double step = (double)t->params.step;
         gsf__mini_loss loss;
-        double norm;
-        t->batch.step = t->params.step;
-        t->ctx.parallel.for_fn(t->ctx.parallel.user, (size_t)t->o.batch, make_sample, &t->batch);
-        result = gsf__mini_forward(&t->run, t->inputs);
-        if (result == GSF_OK) result = gsf__mini_measure_loss(&t->run, t->truth, &loss);
-        if (result == GSF_OK) result = gsf__mini_backward(&t->run, &t->params);
+        double norm, total;
+        result = train_batch(t, &loss, &total);
         adam.average = step / (step + 30.0) < 0.998 ? step / (step + 30.0) : 0.998; // short memory at first
         if (result == GSF_OK) result = gsf__nn_step_adam(&t->ctx, &t->params, &adam, &norm);
-        if (result != GSF_OK) break;
-        sum.relative += loss.relative, sum.square += loss.square, sum.before += loss.before;
-        sum.likelihood += loss.likelihood, sum.fault += loss.fault;
+        if (result == GSF_OK) result = training_keep_loss(&t->ctx, &t->log, total);
+        if (result != GSF_OK || t->ranks.rank != 0) continue;
+        add_loss(&sum, &loss, 1.0);
         counted++;
         if (t->params.step % 100 == 0 || t->params.step == t->o.steps) {
             fprintf(stderr, "step %lld of %d, %.1f CPU minutes: relative error %.3f, %.2f -> %.2f dB, likelihood %.3f, %.3f\n",
-                    (long long)t->params.step, t->o.steps, cpu_minutes(), sum.relative / counted,
+                    (long long)t->params.step, t->o.steps, training_cpu_minutes(), sum.relative / counted,
                     decibels(sum.before / counted), decibels(sum.square / counted), sum.likelihood / counted,
                     sum.fault / counted);
             memset(&sum, 0, sizeof sum);
@@ -271,7 +308,7 @@ static gsf_result check(training* t) {
     gsf__mini net;
     figures sum = {0.0, 0.0}, good_sum = {0.0, 0.0};
     const double share = 1.0 / (double)t->check_count;
-    if (!t->check_count) return GSF_OK;
+    if (!t->check_count || t->ranks.rank != 0) return GSF_OK;
     gsf_result result = gsf__mini_open(&t->ctx, t->o.out, NULL, 0, &net);
     for (size_t i = 0; i < t->check_count && result == GSF_OK; i++) {
         figures all, good;
@@ -295,7 +332,7 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
                 "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only] [--pixels 216] [--fit 599]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -336,22 +373,27 @@ static int parse_options(int argc, char** argv, options* o) {
             else if (strcmp(name, "--threads") == 0) o->threads = (int)x;
             else if (strcmp(name, "--pixels") == 0) o->pixels = (int)x;
             else if (strcmp(name, "--fit") == 0) o->fit = (int)x;
+            else if (strcmp(name, "--groups") == 0) o->groups = (int)x;
             else return 0;
         }
     }
     return o->out && o->data && seed_count(o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
+           training_is_power(o->groups) && o->batch % o->groups == 0 &&
            o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 &&
            2 * o->pixels / 3 >= o->crop;
 }
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1e-3};
+    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1, 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;
     gsf_result result = gsf_init_context(&t.ctx);
-    if (result == GSF_OK) result = open_data(&t);
+    t.ranks = training_begin(&t.ctx, &argc, &argv);
+    if (result == GSF_OK && t.ranks.rank == 0) result = open_data(&t); // it makes what is missing
+    if (result == GSF_OK) training_wait(t.ranks);
+    if (result == GSF_OK && t.ranks.rank != 0) result = open_data(&t);
     if (result == GSF_OK && !t.o.make_only) {
         result = open_network(&t);
         if (result == GSF_OK) result = make_batches(&t);
@@ -359,6 +401,8 @@ int main(int argc, char** argv) {
         if (result == GSF_OK) result = check(&t);
     }
     if (result != GSF_OK) fprintf(stderr, "train_mini: %s\n", t.ctx.error);
+    training_end_sum(&t.ctx, &t.sum);
+    gsf_free(&t.ctx, t.log.losses);
     gsf__mini_end(&t.run);
     gsf__nn_destroy_params(&t.ctx, &t.params);
     gsf__mini_close(&t.ctx, &t.net);
@@ -369,5 +413,5 @@ int main(int argc, char** argv) {
     gsf_free(&t.ctx, t.truth);
     gsf_free(&t.ctx, t.inputs);
     gsf_free(&t.ctx, t.batch.samples);
-    return result == GSF_OK ? 0 : 1;
+    return training_end(t.ranks, result == GSF_OK ? 0 : 1);
 }

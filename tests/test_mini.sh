@@ -32,6 +32,15 @@ wait $pid || true
 cmp one killed || fail "a killed and resumed run has other weights"
 cmp one.state killed.state || fail "a killed and resumed run has another state"
 
+"$train" halves "${short[@]}" --groups 2 --threads 1 > halves.txt
+if command -v mpirun > /dev/null && ldd "$train" 2> /dev/null | grep -q libmpi; then
+    export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+    timeout 120 mpirun --oversubscribe --bind-to none --mca mpi_yield_when_idle 1 -np 2 "$train" ranks "${short[@]}" --groups 2 \
+        --threads 1 > ranks.txt 2> ranks.log || fail "two ranks: $(tail -1 ranks.log)"
+    for file in "" .state .loss.csv; do cmp "halves$file" "ranks$file" || fail "two ranks are not one: $file"; done
+    cmp halves.txt ranks.txt || fail "two ranks print other figures than one"
+fi
+
 "$train" learned "${data[@]}" --batch 4 --steps 150 --rate 0.003 --threads 1 > learned.txt
 awk '/^mean: / { if ($4 < $2 + 0.3) exit 1 }' learned.txt || fail "it has learned nothing: $(tail -1 learned.txt)"
 
