@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """test_web.py PAGE SCRATCH: uses the page of examples/web in headless Chromium, as a visitor would: makes a scene, trains on three
-photos of it, orbits it with the mouse, drops the splats that it saved, and drops a folder of photos. PSNR rises, the pictures
+photos of it, orbits it with the mouse, drops the splats that it saved, and a file that is none. PSNR rises, the pictures
 change, the console has no errors; with threads, where the page is isolated, and without, to the same PSNR. Pictures of
 the page are left in SCRATCH. Exits with 77 without Chromium. The page is driven through Chromium's DevTools protocol over
 pipes."""
