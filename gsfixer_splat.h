@@ -8283,18 +8283,15 @@ enum {
 };
 
 // 2^x for x in [-126, 1], relative error below 2e-7 (minimax polynomial of degree 5 on [-1/2, 1/2]).
-static inline float gsf__exp2_fast(float x) {
-    const float above = x + 0.5f;
-    int32_t k = (int32_t)above;
-    k -= (float)k > above; // rounds down; compilers vectorise this, but not floorf
-    const float f = x - (float)k;
+static float gsf__exp2_fast(float x) {
+    const float k = floorf(x + 0.5f), f = x - k;
     float p = 1.3276404e-3f;
     p = p * f + 9.6755413e-3f;
     p = p * f + 5.5507135e-2f;
     p = p * f + 0.24022120f;
     p = p * f + 0.69314694f;
     p = p * f + 1.0000001f;
-    const int32_t bits = (k + 127) * (1 << 23);
+    const int32_t bits = ((int32_t)k + 127) << 23;
     float scale;
     memcpy(&scale, &bits, sizeof scale);
     return p * scale;
@@ -8322,15 +8319,9 @@ static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, 
     return mask;
 }
 
-// Columns of the pixels of strip k, from 16 k on, and rows of those of a pair of rows j, from 8 j on: for one or two steps.
-GSF__LINES static const float gsf__columns_of[64] = {0,  0,  1,  1,  2,  2,  3,  3,  0,  0,  1,  1,  2,  2,  3,  3,
-                                                     4,  4,  5,  5,  6,  6,  7,  7,  4,  4,  5,  5,  6,  6,  7,  7,
-                                                     8,  8,  9,  9,  10, 10, 11, 11, 8,  8,  9,  9,  10, 10, 11, 11,
-                                                     12, 12, 13, 13, 14, 14, 15, 15, 12, 12, 13, 13, 14, 14, 15, 15};
-GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,  2,  3,  2,  3,  2,  3,  2,  3,
-                                                  4,  5,  4,  5,  4,  5,  4,  5,  6,  7,  6,  7,  6,  7,  6,  7,
-                                                  8,  9,  8,  9,  8,  9,  8,  9,  10, 11, 10, 11, 10, 11, 10, 11,
-                                                  12, 13, 12, 13, 12, 13, 12, 13, 14, 15, 14, 15, 14, 15, 14, 15};
+// Row and column, in the tile, of a pixel of a step.
+static int gsf__step_row(int s, int lane) { return 2 * (s & 7) + lane % 2; }
+static int gsf__step_column(int s, int lane) { return GSF__STRIP * (s >> 3) + lane / 2; }
 
 static uint32_t gsf__live_steps(const float* T) {
     uint32_t live = 0;
@@ -8350,74 +8341,61 @@ static int gsf__lowest_bit(uint32_t mask) {
 #endif
 }
 
-// The scalar kernels process the pixels of a step in loops that compilers vectorise: gcc does not if a conditional operator
-// has an operand that is computed for it, so that values are selected by masks (-1 or 0).
-
-static inline float gsf__select_if(int32_t mask, float yes, float no) {
-    int32_t a, b;
-    memcpy(&a, &yes, sizeof a);
-    memcpy(&b, &no, sizeof b);
-    a = (a & mask) | (b & ~mask);
-    memcpy(&yes, &a, sizeof a);
-    return yes;
-}
-
-static inline float gsf__keep_if(int32_t mask, float x) { return gsf__select_if(mask, x, 0.0f); }
-
-static inline float gsf__clamp_alpha(float raw) {
-    return gsf__select_if(-(int32_t)(raw < GSF__ALPHA_MAX), raw, GSF__ALPHA_MAX);
-}
-
-// Alphas of a step's pixels before the clamp, 0 where below 1/255.
-static inline void gsf__alphas_scalar(const gsf__record* rec, uint32_t s, const float center[GSF__TILE],
-                                      const float exponent[GSF__TILE], float* GSF_RESTRICT raw) {
-    const int first = GSF__STRIP * (int)(s >> 3);
-    const uint32_t row = 2 * (s & 7);
-    const float ee = rec->ee, c0 = center[row], c1 = center[row + 1], x0 = exponent[row], x1 = exponent[row + 1];
-    for (int i = 0; i < GSF__STRIP; i++) {
-        const float e0 = (float)(first + i) - c0, e1 = (float)(first + i) - c1;
-        const float y0 = ee * e0 * e0 + x0, y1 = ee * e1 * e1 + x1;
-        const int32_t seen0 = -(int32_t)(y0 >= GSF__LOG2_ALPHA_MIN), seen1 = -(int32_t)(y1 >= GSF__LOG2_ALPHA_MIN);
-        raw[2 * i] = gsf__keep_if(seen0, gsf__exp2_fast(gsf__keep_if(seen0, y0)));
-        raw[2 * i + 1] = gsf__keep_if(seen1, gsf__exp2_fast(gsf__keep_if(seen1, y1)));
+// Blends a splat into the T of one pixel. Returns its alpha before the clamp, or 0 if it is not blended.
+static float gsf__blend_pixel(const gsf__record* rec, float column, float center, float exponent, float* T) {
+    const float e = column - center;
+    const float x = rec->ee * e * e + exponent;
+    if (!(x >= GSF__LOG2_ALPHA_MIN) || !(*T > 0.0f)) return 0.0f;
+    const float raw = gsf__exp2_fast(x);
+    const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX;
+    const float next = *T * (1.0f - alpha);
+    if (next < GSF__T_MIN) {
+        *T = -*T;
+        return 0.0f;
     }
-}
-
-// Blends alphas before the clamp into the T of a step's pixels, and sets those to 0 that are not blended. Returns whether
-// a pixel remains open. A finished pixel stays so, because its T is negative.
-static inline int gsf__next_scalar(float* GSF_RESTRICT T, float* GSF_RESTRICT raw) {
-    int32_t open = 0;
-    for (int lane = 0; lane < 8; lane++) {
-        const float next = T[lane] * (1.0f - gsf__clamp_alpha(raw[lane]));
-        const int32_t shown = -(int32_t)(next >= GSF__T_MIN);
-        T[lane] = gsf__select_if(shown, next, -fabsf(T[lane]));
-        raw[lane] = gsf__keep_if(shown, raw[lane]);
-        open |= shown;
-    }
-    return open != 0;
+    *T = next;
+    return raw;
 }
 
 static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int flags) {
     uint32_t live = gsf__live_steps(state->T);
-    float center[GSF__TILE], exponent[GSF__TILE], raw[8], w[8];
+    float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
-        const float red = rec->r, green = rec->g, blue = rec->b, depth = rec->depth;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            float *T = state->T + 8 * s, *r = state->r + 8 * s, *g = state->g + 8 * s, *b = state->b + 8 * s;
-            gsf__alphas_scalar(rec, s, center, exponent, raw);
-            memcpy(w, T, sizeof w);
-            if (!gsf__next_scalar(T, raw)) live &= ~(1u << s);
-            for (int lane = 0; lane < 8; lane++) w[lane] *= gsf__clamp_alpha(raw[lane]);
-            for (int lane = 0; lane < 8; lane++) r[lane] += w[lane] * red;
-            for (int lane = 0; lane < 8; lane++) g[lane] += w[lane] * green;
-            for (int lane = 0; lane < 8; lane++) b[lane] += w[lane] * blue;
-            if (!(flags & GSF__WITH_DEPTH)) continue;
-            for (int lane = 0; lane < 8; lane++) state->z[8 * s + (uint32_t)lane] += w[lane] * depth;
+            const int s = gsf__lowest_bit(m);
+            int open = 0;
+            for (int lane = 0; lane < 8; lane++) {
+                const int k = 8 * s + lane, row = gsf__step_row(s, lane);
+                const float T = state->T[k], column = (float)gsf__step_column(s, lane);
+                const float raw = gsf__blend_pixel(rec, column, center[row], exponent[row], &state->T[k]);
+                const float w = (raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX) * T;
+                if (raw > 0.0f) {
+                    state->r[k] += w * rec->r;
+                    state->g[k] += w * rec->g;
+                    state->b[k] += w * rec->b;
+                    if (flags & GSF__WITH_DEPTH) state->z[k] += w * rec->depth;
+                }
+                open |= state->T[k] > 0.0f;
+            }
+            if (!open) live &= ~(1u << s);
         }
     }
 }
+
+#if GSF__X86 || GSF__SIMD128
+
+// Columns of the pixels of strip k, from 16 k on, and rows of those of a pair of rows j, from 8 j on: for one or two steps.
+GSF__LINES static const float gsf__columns_of[64] = {0,  0,  1,  1,  2,  2,  3,  3,  0,  0,  1,  1,  2,  2,  3,  3,
+                                                     4,  4,  5,  5,  6,  6,  7,  7,  4,  4,  5,  5,  6,  6,  7,  7,
+                                                     8,  8,  9,  9,  10, 10, 11, 11, 8,  8,  9,  9,  10, 10, 11, 11,
+                                                     12, 12, 13, 13, 14, 14, 15, 15, 12, 12, 13, 13, 14, 14, 15, 15};
+GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,  2,  3,  2,  3,  2,  3,  2,  3,
+                                                  4,  5,  4,  5,  4,  5,  4,  5,  6,  7,  6,  7,  6,  7,  6,  7,
+                                                  8,  9,  8,  9,  8,  9,  8,  9,  10, 11, 10, 11, 10, 11, 10, 11,
+                                                  12, 13, 12, 13, 12, 13, 12, 13, 14, 15, 14, 15, 14, 15, 14, 15};
+
+#endif
 
 #if GSF__X86
 
@@ -8438,14 +8416,6 @@ GSF__INLINE_AVX2 const gsf__record* gsf__batch_entry(const gsf__tile* tile, size
     batch->u[at] = rec->u - tile->x0 + rec->u_low;
     batch->v[at] = rec->v - tile->y0 + rec->v_low;
     return rec;
-}
-
-// Bits of the pairs of rows whose interval from..to overlaps the strip that begins at column `first`.
-GSF__INLINE_AVX2 uint32_t gsf__strip_avx2(__m256 from, __m256 to, float first) {
-    const __m256 last = _mm256_set1_ps(first + (float)(GSF__STRIP - 1));
-    const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ),
-                                     _mm256_cmp_ps(to, _mm256_set1_ps(first), _CMP_GE_OQ));
-    return (uint32_t)_mm256_movemask_ps(met);
 }
 
 // Like gsf__rows_scalar, 8 rows at a time.
@@ -8471,20 +8441,26 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float 
     __m256 to = _mm256_max_ps(_mm256_shuffle_ps(right[0], right[1], 0x88), _mm256_shuffle_ps(right[0], right[1], 0xdd));
     from = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(from), 0xd8));
     to = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(to), 0xd8));
-    return gsf__strip_avx2(from, to, 0.0f) | gsf__strip_avx2(from, to, 4.0f) << 8 |
-           gsf__strip_avx2(from, to, 8.0f) << 16 | gsf__strip_avx2(from, to, 12.0f) << 24;
+    uint32_t mask = 0;
+    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+        const float column = (float)(GSF__STRIP * strip);
+        const __m256 first = _mm256_set1_ps(column), last = _mm256_set1_ps(column + (float)(GSF__STRIP - 1));
+        const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ), _mm256_cmp_ps(to, first, _CMP_GE_OQ));
+        mask |= (uint32_t)_mm256_movemask_ps(met) << (8 * strip);
+    }
+    return mask;
 }
 
 GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
-    const __m256 rounder = _mm256_set1_ps(12582912.0f); // leaves the nearest integer, ties to even, in the low bits
-    const __m256 rounded = _mm256_add_ps(x, rounder), f = _mm256_sub_ps(x, _mm256_sub_ps(rounded, rounder));
+    const __m256 k = _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const __m256 f = _mm256_sub_ps(x, k);
     __m256 p = _mm256_set1_ps(1.3276404e-3f);
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(9.6755413e-3f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(5.5507135e-2f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.24022120f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.69314694f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(1.0000001f));
-    const __m256i shift = _mm256_slli_epi32(_mm256_castps_si256(rounded), 23);
+    const __m256i shift = _mm256_slli_epi32(_mm256_cvtps_epi32(k), 23);
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
@@ -8526,15 +8502,7 @@ GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 T, __m256 alpha, __m256* weight, _
 
 GSF__INLINE_AVX2 uint32_t gsf__live_avx2(const float* T) {
     uint32_t live = 0;
-    for (uint32_t s = 0; s < GSF__STEPS; s += 4) { // packs the signs of four steps; each half has four pixels of a step
-        __m256i v[4];
-        for (uint32_t k = 0; k < 4; k++) v[k] = _mm256_castps_si256(_mm256_loadu_ps(T + 8 * (s + k)));
-        const __m256i signs = _mm256_packs_epi16(_mm256_packs_epi32(v[0], v[1]), _mm256_packs_epi32(v[2], v[3]));
-        const __m128i sign = _mm_set1_epi8(-128);
-        const __m128i both = _mm_and_si128(_mm256_castsi256_si128(signs), _mm256_extracti128_si256(signs, 1));
-        const __m128i closed = _mm_cmpeq_epi32(_mm_and_si128(both, sign), sign);
-        live |= (uint32_t)(_mm_movemask_ps(_mm_castsi128_ps(closed)) ^ 15) << s;
-    }
+    for (uint32_t s = 0; s < GSF__STEPS; s++) live |= (uint32_t)(_mm256_movemask_ps(_mm256_loadu_ps(T + 8 * s)) != 255) << s;
     return live;
 }
 
@@ -8831,24 +8799,30 @@ static void gsf__blend_simd128(const gsf__tile* tile, gsf__tile_state* state, in
 
 // ---- >>raster backward ---------------------------------------------------------
 
-static size_t gsf__keep_scalar(const gsf__tile* tile, float* T_tile, size_t first, size_t last, gsf__step* steps,
+static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps,
                                gsf__step_head* heads, size_t* step_count) {
-    uint32_t live = gsf__live_steps(T_tile);
+    uint32_t live = gsf__live_steps(T);
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            float *T = T_tile + 8 * s, *raw = steps[kept].alpha;
-            gsf__alphas_scalar(rec, s, center, exponent, raw);
-            memcpy(steps[kept].T, T, 8 * sizeof(float));
-            if (!gsf__next_scalar(T, raw)) live &= ~(1u << s);
-            int any = 0;
-            for (int lane = 0; lane < 8; lane++) any |= raw[lane] > 0.0f;
+            const int s = gsf__lowest_bit(m);
+            int open = 0, any = 0;
+            for (int lane = 0; lane < 8; lane++) {
+                float* t = T + 8 * s + lane;
+                const int row = gsf__step_row(s, lane);
+                const float column = (float)gsf__step_column(s, lane);
+                steps[kept].T[lane] = *t > 0.0f ? *t : 0.0f;
+                const float raw = gsf__blend_pixel(rec, column, center[row], exponent[row], t);
+                steps[kept].alpha[lane] = raw;
+                any |= raw > 0.0f;
+                open |= *t > 0.0f;
+            }
             heads[kept].entry = (uint32_t)i;
-            heads[kept].step = s;
+            heads[kept].step = (uint32_t)s;
             kept += (size_t)any;
+            if (!open) live &= ~(1u << s);
         }
     }
     *step_count = kept;
@@ -8863,57 +8837,42 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T_tile, size_t firs
 static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
                                 size_t step_count, gsf__tile_gradient* gradient, float* slots,
                                 uint8_t* slot_used, int flags) {
-    const float alpha_most = flags & GSF__STRAIGHT_THROUGH ? FLT_MAX : GSF__ALPHA_MAX; // of those with a gradient
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->pairs[entry].splat;
-        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low, kx = rec->kx;
-        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -kx * conic_a;
-        const float red = rec->r, green = rec->g, blue = rec->b, depth = rec->depth;
-        float sums[GSF__SLOT_FLOATS], part[GSF__SLOT_FLOATS][8]; // of a step's pixels
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        float sums[GSF__SLOT_FLOATS];
         memset(sums, 0, sizeof sums);
-        memset(part, 0, sizeof part);
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
-            const float *raws = steps[k - 1].alpha, *Ts = steps[k - 1].T;
-            const uint32_t s = heads[k - 1].step;
-            const float *gr = gradient->r + 8 * s, *gg = gradient->g + 8 * s, *gb = gradient->b + 8 * s;
-            const float *columns = gsf__columns_of + 16 * (s >> 3), *rows = gsf__rows_of + 8 * (s & 7);
-            float *behind = gradient->behind + 8 * s, F[8], w[8], p[8], next[8];
-            for (int lane = 0; lane < 8; lane++) F[lane] = red * gr[lane] + green * gg[lane] + blue * gb[lane];
-            if (flags & GSF__WITH_DEPTH) {
-                const float *gz = gradient->z + 8 * s, *ga = gradient->a + 8 * s;
-                for (int lane = 0; lane < 8; lane++) F[lane] += depth * gz[lane] + ga[lane];
-            }
+            const gsf__step* step = steps + k - 1;
+            const int s = (int)heads[k - 1].step;
             for (int lane = 0; lane < 8; lane++) {
-                const float raw = raws[lane], T = Ts[lane], alpha = gsf__clamp_alpha(raw);
-                const float difference = F[lane] - behind[lane];
-                const int32_t shown = -(int32_t)(raw > 0.0f), sloped = -(int32_t)(raw <= alpha_most);
-                next[lane] = gsf__select_if(shown, behind[lane] + alpha * difference, behind[lane]);
-                p[lane] = gsf__keep_if(shown & sloped, T * difference * raw);
-                w[lane] = alpha * T;
-                part[GSF__SLOT_R][lane] = gsf__keep_if(shown, w[lane] * gr[lane]);
-                part[GSF__SLOT_G][lane] = gsf__keep_if(shown, w[lane] * gg[lane]);
-                part[GSF__SLOT_B][lane] = gsf__keep_if(shown, w[lane] * gb[lane]);
+                const float raw = step->alpha[lane];
+                if (!(raw > 0.0f)) continue;
+                const int at = 8 * s + lane;
+                const float dy = (float)gsf__step_row(s, lane) - v, center = u + rec->kx * dy;
+                const float e = (float)gsf__step_column(s, lane) - center;
+                const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX, w = alpha * step->T[lane];
+                float F = rec->r * gradient->r[at] + rec->g * gradient->g[at] + rec->b * gradient->b[at];
+                if (flags & GSF__WITH_DEPTH) F += rec->depth * gradient->z[at] + gradient->a[at];
+                const float difference = F - gradient->behind[at];
+                gradient->behind[at] += alpha * difference;
+                float p = step->T[lane] * difference * raw;
+                if (raw > GSF__ALPHA_MAX && !(flags & GSF__STRAIGHT_THROUGH)) p = 0.0f;
+                sums[GSF__SLOT_P] += p;
+                sums[GSF__SLOT_E] += p * e;
+                sums[GSF__SLOT_EE] += p * e * e;
+                sums[GSF__SLOT_Y] += p * dy;
+                sums[GSF__SLOT_EY] += p * e * dy;
+                sums[GSF__SLOT_YY] += p * dy * dy;
+                sums[GSF__SLOT_R] += w * gradient->r[at];
+                sums[GSF__SLOT_G] += w * gradient->g[at];
+                sums[GSF__SLOT_B] += w * gradient->b[at];
+                if (flags & GSF__WITH_DEPTH) sums[GSF__SLOT_Z] += w * gradient->z[at];
+                sums[GSF__SLOT_ABS_X] += fabsf(p * conic_a * e);
+                sums[GSF__SLOT_ABS_Y] += fabsf(p * (conic_b * e + conic_q * dy));
             }
-            memcpy(behind, next, sizeof next);
-            memcpy(part[GSF__SLOT_P], p, sizeof p);
-            for (int lane = 0; lane < 8; lane++) {
-                const float dy = rows[lane] - v, center = u + kx * dy, e = columns[lane] - center, pe = p[lane] * e;
-                part[GSF__SLOT_E][lane] = pe;
-                part[GSF__SLOT_EE][lane] = pe * e;
-                part[GSF__SLOT_Y][lane] = p[lane] * dy;
-                part[GSF__SLOT_EY][lane] = pe * dy;
-                part[GSF__SLOT_YY][lane] = p[lane] * dy * dy;
-                part[GSF__SLOT_ABS_X][lane] = fabsf(p[lane] * conic_a * e);
-                part[GSF__SLOT_ABS_Y][lane] = fabsf(p[lane] * (conic_b * e + conic_q * dy));
-            }
-            if (flags & GSF__WITH_DEPTH) {
-                const float* gz = gradient->z + 8 * s;
-                for (int lane = 0; lane < 8; lane++)
-                    part[GSF__SLOT_Z][lane] = gsf__keep_if(-(int32_t)(raws[lane] > 0.0f), w[lane] * gz[lane]);
-            }
-            for (int i = 0; i < GSF__SLOT_FLOATS; i++)
-                for (int lane = 0; lane < 8; lane++) sums[i] += part[i][lane];
         }
         const size_t slot = tile->pairs[entry].slot;
         memcpy(slots + GSF__SLOT_FLOATS * slot, sums, sizeof sums); // complete: an entry's steps are all in one bucket
@@ -9631,17 +9590,15 @@ static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int ch
     return value;
 }
 
-// The colours of `width` pixels of a row in a strip, over the background, and their T. They are written to the image value
-// by value: reading values just written as one vector, as a copy would, stalls.
-static inline void gsf__row_colors(const gsf__tile_state* state, int at, int width, const float background[3], char* rgb,
+// The colours of `width` pixels of a row in a strip, over the background, and their T.
+static inline void gsf__row_colors(const gsf__tile_state* state, int at, int width, const float background[3], float* rgb,
                                    float* T) {
     for (int i = 0; i < width; i++) {
         const int k = at + 2 * i;
-        const float t = fabsf(state->T[k]);
-        const float color[3] = {state->r[k] + t * background[0], state->g[k] + t * background[1],
-                                state->b[k] + t * background[2]};
-        T[i] = t;
-        for (int c = 0; c < 3; c++) memcpy(rgb + sizeof(float) * (size_t)(3 * i + c), color + c, sizeof(float));
+        T[i] = fabsf(state->T[k]);
+        rgb[3 * i] = state->r[k] + T[i] * background[0];
+        rgb[3 * i + 1] = state->g[k] + T[i] * background[1];
+        rgb[3 * i + 2] = state->b[k] + T[i] * background[2];
     }
 }
 
@@ -9661,15 +9618,16 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     for (int q = 0; q < GSF__TILE / GSF__STRIP * rows; q++) {
         const int strip = q % (GSF__TILE / GSF__STRIP), row = q / (GSF__TILE / GSF__STRIP);
         const int width = gsf__strip_width(strip, columns), at = gsf__strip_pixel(strip, row);
-        if (width == 0) continue;
         const int64_t x = (int64_t)tile.x0 + GSF__STRIP * strip, y = (int64_t)tile.y0 + row;
         const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
-        float rgb[3 * GSF__STRIP], *T = r->final_T + pixel;
-        if (width == GSF__STRIP && packed && color->data) { // most rows: a loop of constant length
-            gsf__row_colors(&state, at, GSF__STRIP, job->view->background,
-                            (char*)color->data + y * color->stride_y + x * color->stride_x, T);
+        float rgb[3 * GSF__STRIP], T[GSF__STRIP];
+        if (width == GSF__STRIP && packed && color->data) { // most rows: loops and copies of constant length
+            gsf__row_colors(&state, at, GSF__STRIP, job->view->background, rgb, T);
+            memcpy(r->final_T + pixel, T, sizeof T);
+            memcpy((char*)color->data + y * color->stride_y + x * color->stride_x, rgb, sizeof rgb);
         } else {
-            gsf__row_colors(&state, at, width, job->view->background, (char*)rgb, T);
+            gsf__row_colors(&state, at, width, job->view->background, rgb, T);
+            if (width) memcpy(r->final_T + pixel, T, (size_t)width * sizeof(float));
             for (int k = 0; k < 3 * width && color->data; k++) gsf__put_pixel(color, x + k / 3, y, k % 3, rgb[k]);
         }
         for (int lane = 0; lane < width && r->has_depth; lane++) r->depth_sum[pixel + (size_t)lane] = state.z[at + 2 * lane];
