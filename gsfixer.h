@@ -1136,6 +1136,26 @@ GSF__SHARED void gsf__list_carried(gsf_carried* carried, gsf_image* images[GSF__
     memcpy(channels, counts, sizeof counts);
 }
 
+// Unit quaternion (w x y z, w >= 0) of the rotation of a column-major rigid transform.
+GSF__SHARED void gsf__quat_of(const double m[16], double quat[4]) {
+    // Four times the squares of w, x, y, z; dividing by the largest is well conditioned (Shepperd 1978).
+    const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
+                         1.0 - m[0] - m[5] + m[10]};
+    int most = 0;
+    for (int i = 1; i < 4; i++)
+        if (s[i] > s[most]) most = i;
+    double q[4];
+    switch (most) {
+        case 0: q[0] = s[0]; q[1] = m[6] - m[9]; q[2] = m[8] - m[2]; q[3] = m[1] - m[4]; break;
+        case 1: q[0] = m[6] - m[9]; q[1] = s[1]; q[2] = m[1] + m[4]; q[3] = m[8] + m[2]; break;
+        case 2: q[0] = m[8] - m[2]; q[1] = m[1] + m[4]; q[2] = s[2]; q[3] = m[6] + m[9]; break;
+        default: q[0] = m[1] - m[4]; q[1] = m[8] + m[2]; q[2] = m[6] + m[9]; q[3] = s[3]; break;
+    }
+    const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    const double scale = (q[0] < 0.0 ? -1.0 : 1.0) / length;
+    for (int i = 0; i < 4; i++) quat[i] = q[i] * scale;
+}
+
 typedef gsf_result (*gsf__carry_fn)(void* carry_user, gsf_context* ctx, int32_t frame, int32_t slot, gsf_carried* out);
 
 // The window's carry_fn; NULL also if an older host's window ends before it.
@@ -5420,22 +5440,6 @@ static gsf_result gsf__save_transforms(gsf_context* ctx, const char* path, const
     return gsf__write_text(ctx, path, &text);
 }
 
-// w x y z of the rotation of a rigid w2c, by the largest of the four squares, which loses no digits.
-static void gsf__camera_quaternion(const double m[16], double q[4]) {
-    const double trace[4] = {m[0] + m[5] + m[10], m[0] - m[5] - m[10], m[5] - m[0] - m[10], m[10] - m[0] - m[5]};
-    const double off[3][2] = {{m[6] - m[9], m[6] + m[9]}, {m[8] - m[2], m[8] + m[2]}, {m[1] - m[4], m[1] + m[4]}};
-    int best = 0;
-    for (int k = 1; k < 4; k++)
-        if (trace[k] > trace[best]) best = k;
-    const double root = sqrt(1.0 + trace[best]), scale = 0.5 / root;
-    q[best] = 0.5 * root;
-    if (best == 0)
-        for (int k = 0; k < 3; k++) q[1 + k] = off[k][0] * scale;
-    else
-        for (int k = 0; k < 3; k++) // products of x y z: those of the pair without k
-            q[k == best - 1 ? 0 : 1 + k] = off[k == best - 1 ? k : 3 - k - (best - 1)][k != best - 1] * scale;
-}
-
 // `path` is that of images.txt. An image has two lines, of which the second, its points, is empty.
 static gsf_result gsf__save_colmap_text(gsf_context* ctx, const char* path, const gsf_camera* cameras, const char* const* names,
                                         size_t count) {
@@ -5461,7 +5465,7 @@ static gsf_result gsf__save_colmap_text(gsf_context* ctx, const char* path, cons
             gsf__append_values(ctx, &list, values, 4, " ");
             gsf_append_text(ctx, &list, "\n");
         }
-        gsf__camera_quaternion(c->w2c, values);
+        gsf__quat_of(c->w2c, values);
         memcpy(values + 4, c->w2c + 12, 3 * sizeof(double));
         gsf__camera_file(names, i, name);
         gsf_append_text(ctx, &images, "%zu ", i + 1);

@@ -2289,24 +2289,6 @@ static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_
     return result;
 }
 
-// Converts the rotation of a column-major matrix to a unit quaternion w x y z, w >= 0. Divides by the largest component
-// for accuracy.
-static void gsf__quaternion_from_pose(const double m[16], double q[4]) {
-    const double squares[4] = {1 + m[0] + m[5] + m[10], 1 + m[0] - m[5] - m[10], 1 - m[0] + m[5] - m[10],
-                               1 - m[0] - m[5] + m[10]};
-    const double mixed[4][4] = {{squares[0], m[6] - m[9], m[8] - m[2], m[1] - m[4]},
-                                {m[6] - m[9], squares[1], m[1] + m[4], m[8] + m[2]},
-                                {m[8] - m[2], m[1] + m[4], squares[2], m[6] + m[9]},
-                                {m[1] - m[4], m[8] + m[2], m[6] + m[9], squares[3]}};
-    int best = 0;
-    double norm = 0.0;
-    for (int i = 1; i < 4; i++)
-        if (squares[i] > squares[best]) best = i;
-    for (int i = 0; i < 4; i++) q[i] = mixed[best][i], norm += q[i] * q[i];
-    norm = q[0] < 0.0 ? -sqrt(norm) : sqrt(norm);
-    for (int i = 0; i < 4; i++) q[i] /= norm;
-}
-
 /* .glb: binary glTF 2.0 with the extension KHR_gaussian_splatting, as ratified: a header, a chunk of JSON and a chunk of
    arrays, to which the JSON's accessors point. A primitive of points has the attributes POSITION and, with the extension's
    name in front, ROTATION (unit, x y z w), SCALE (not its logarithm), OPACITY (not its logit) and SH_DEGREE_l_COEF_n, whose
@@ -2508,7 +2490,7 @@ static gsf_result gsf__glb_split_matrix(const gsf__glb* glb, const gsf_json_valu
         return gsf_fail(glb->ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a node that stretches or mirrors its splats", glb->name,
                         GSF__GLB_HEAD + GSF__GLB_CHUNK + (size_t)at->offset);
     for (int i = 0; i < 16; i++) pose[i] = m[i] / scale;
-    gsf__quaternion_from_pose(pose, q);
+    gsf__quat_of(pose, q);
     for (int k = 0; k < 4; k++) part->quat[k] = (float)q[k];
     part->scale = scale;
     return GSF_OK;
@@ -4728,7 +4710,7 @@ static void gsf__format_images(gsf_context* ctx, const gsf_scene* scene, const u
     for (size_t v = 0; v < scene->view_count; v++) {
         const gsf_scene_view* view = &scene->views[v];
         double q[4];
-        gsf__quaternion_from_pose(view->camera.w2c, q);
+        gsf__quat_of(view->camera.w2c, q);
         gsf__put_le(ctx, out, view->image_id, 4);
         for (int k = 0; k < 4; k++) gsf__put_double(ctx, out, q[k]);
         for (int k = 0; k < 3; k++) gsf__put_double(ctx, out, view->camera.w2c[12 + k]);

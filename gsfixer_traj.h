@@ -386,26 +386,6 @@ GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const
 
 // ---- >>rotations ---------------------------------------------------------------
 
-// Unit quaternion (w x y z, w >= 0) of a pose's rotation.
-static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
-    // Four times the squares of w, x, y, z; dividing by the largest is well conditioned (Shepperd 1978).
-    const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
-                         1.0 - m[0] - m[5] + m[10]};
-    int most = 0;
-    for (int i = 1; i < 4; i++)
-        if (s[i] > s[most]) most = i;
-    double q[4];
-    switch (most) {
-        case 0: q[0] = s[0]; q[1] = m[6] - m[9]; q[2] = m[8] - m[2]; q[3] = m[1] - m[4]; break;
-        case 1: q[0] = m[6] - m[9]; q[1] = s[1]; q[2] = m[1] + m[4]; q[3] = m[8] + m[2]; break;
-        case 2: q[0] = m[8] - m[2]; q[1] = m[1] + m[4]; q[2] = s[2]; q[3] = m[6] + m[9]; break;
-        default: q[0] = m[1] - m[4]; q[1] = m[8] + m[2]; q[2] = m[6] + m[9]; q[3] = s[3]; break;
-    }
-    const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    const double scale = (q[0] < 0.0 ? -1.0 : 1.0) / length;
-    for (int i = 0; i < 4; i++) quat[i] = q[i] * scale;
-}
-
 // Sets the rotation of a pose from a quaternion of any non-zero length; the position is unchanged.
 static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     const double w = q[0], x = q[1], y = q[2], z = q[3];
@@ -452,8 +432,8 @@ static void gsf__traj_slerp(const double a[4], const double b[4], double t, doub
 // Linear interpolation of the position, slerp of the rotation. out may be a or b.
 static void gsf__traj_blend_poses(const double a[16], const double b[16], double t, double out[16]) {
     double qa[4], qb[4], q[4], position[3];
-    gsf__traj_pose_quat(a, qa);
-    gsf__traj_pose_quat(b, qb);
+    gsf__quat_of(a, qa);
+    gsf__quat_of(b, qb);
     gsf__traj_slerp(qa, qb, t, q);
     for (int i = 0; i < 3; i++) position[i] = a[12 + i] + (b[12 + i] - a[12 + i]) * t;
     gsf__traj_quat_axes(q, out);
@@ -1554,7 +1534,7 @@ static void gsf__traj_localize(gsf__traj_job* job) {
     for (size_t n = 0; n < job->count; n++) {
         double quat[4], *view = job->views + 16 * n;
         gsf_get_camera_c2w(&job->cameras[n], view);
-        gsf__traj_pose_quat(view, quat);
+        gsf__quat_of(view, quat);
         gsf__traj_quat_axes(quat, view);
     }
     job->magnitude = gsf__traj_magnitude(job->views + 12, job->count, 16);

@@ -140,9 +140,9 @@ static const option_spec option_specs[] = {
     {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix evaluate",
      "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
      "on nor measured, grey ones count partially (default on)"},
-    {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
-     "background colour: black, white, R,G,B from 0 to 1 or, for fix, photos (a grey as bright as they are, the\n"
-     "default unless --regularize is off) or random (a new one in each step); by default, render takes that of SPLATS.ply,\n"
+    {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render view",
+     "background colour: black, white, R,G,B from 0 to 1 or, in training, photos (a grey as bright as they are, the\n"
+     "default unless --regularize is off) or random (a new one in each step); for splats by default that of the .ply file,\n"
      "or else black"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "dataset evaluate", "go on with what an interrupted run has left in OUT"},
@@ -424,6 +424,14 @@ int gsfix_background(gsfix_app* app, const char* text, float out[3], gsf_backgro
         p = end + 1;
     }
     return 0;
+}
+
+int gsfix_splats_background(gsfix_app* app, float out[3]) {
+    const char* text = app->o.background;
+    gsf_background kind;
+    const int code = text ? gsfix_background(app, text, out, &kind) : 0;
+    if (code || !text || kind == GSF_BACKGROUND_GIVEN) return code;
+    return gsfix_misused(app, "--background %s: for training only", text);
 }
 
 gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out) {
@@ -1040,13 +1048,10 @@ static int run_render(gsfix_app* app) {
     if (app->o.depth_as && !depth_is_exr(app) && !depth_is_png(app))
         return gsfix_misused(app, "--depth-as %s: one of exr and png16", app->o.depth_as);
     if (app->o.depth_as && !app->o.depth) return gsfix_misused(app, "--depth-as: only with --depth");
-    const char* text = app->o.background;
     float background[3];
-    gsf_background kind;
-    const int code = text ? gsfix_background(app, text, background, &kind) : 0;
+    const int code = gsfix_splats_background(app, background);
     if (code) return code;
-    if (text && kind != GSF_BACKGROUND_GIVEN) return gsfix_misused(app, "--background %s: for training only", text);
-    return render_all(app, text ? background : NULL) == GSF_OK ? 0 : gsfix_failed(app);
+    return render_all(app, app->o.background ? background : NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- filter ----------------------------------------------------------------------

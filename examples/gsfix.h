@@ -100,6 +100,7 @@ void gsfix_print(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);  // 
 void gsfix_hide_bar(gsfix_app* app);
 int gsfix_misused(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3); // one line on stderr; returns 2
 int gsfix_background(gsfix_app* app, const char* text, float out[3], gsf_background* kind); // 0 or an exit code
+int gsfix_splats_background(gsfix_app* app, float out[3]); // of --background, if given; 0 or an exit code
 int gsfix_failed(gsfix_app* app); // prints ctx.error; returns 1
 
 // Append members to a JSON object in a gsf_buffer.

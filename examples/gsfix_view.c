@@ -91,7 +91,7 @@ static gsf_result view_open_splats(viewer* v) {
     v->stale = 1;
     v->desc.near_plane = (float)(0.02 * radius);
     v->desc.antialiased = v->splats.antialiased;
-    memcpy(v->desc.background, v->splats.background, sizeof v->desc.background);
+    if (!v->app->o.background) memcpy(v->desc.background, v->splats.background, sizeof v->desc.background);
     return GSF_OK;
 }
 
@@ -452,7 +452,7 @@ int gsfix_run_view(gsfix_app* app) {
     viewer v = zero;
     gsfix_setup setup;
     const int is_scene = gsfix_is_folder(app->o.inputs[0]);
-    const int code = is_scene ? gsfix_resolve_setup(app, &setup) : 0;
+    const int code = is_scene ? gsfix_resolve_setup(app, &setup) : gsfix_splats_background(app, v.desc.background);
     if (code) return code;
     const char* r = app->o.restorer;
     if (r && (!is_scene || strncmp(r, "dit:", 4) == 0 || strncmp(r, "exec:", 5) == 0)) // these need an output folder

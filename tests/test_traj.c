@@ -770,8 +770,8 @@ static void test_rotations(void) {
         gsf__traj_quat_axes(q, pose);
         gsf__traj_quat_axes(p, other);
         CHECK(rigidity(pose) < 1e-14);
-        gsf__traj_pose_quat(pose, back);
-        gsf__traj_pose_quat(other, p);
+        gsf__quat_of(pose, back);
+        gsf__quat_of(other, p);
         const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         double dot = 0.0;
         for (int i = 0; i < 4; i++) dot += back[i] * q[i] / length;

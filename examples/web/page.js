@@ -215,8 +215,8 @@ function startPage() {
     function showState(s) {
         app.state = s;
         const psnr = s.heldOut && s.psnr !== null ? s.psnr : null;
-        if (s.iterations && psnr !== null && (!curve.length || (s.iteration % 25 === 0 && curve[curve.length - 1].step < s.iteration))) {
-            curve.push({step: s.iteration, psnr});
+        if (s.iterations && psnr !== null && (!curve.length || curve[curve.length - 1].step < s.measured)) {
+            curve.push({step: s.measured, psnr});
             drawCurve(s.iterations);
         }
         $("step").textContent = s.iterations ? `${s.iteration} of ${s.iterations}` : "–";

@@ -38,7 +38,8 @@ static struct web {
     gsf_fix_stats stats;
     gsf_train_stats last;
     int32_t iterations;
-    double psnr; // mean over the photos that are not trained on
+    double psnr; // mean over the photos that are not trained on, after `measured` iterations
+    int32_t measured;
     gsf_rasterizer* rasterizer;
     gsf_render_desc desc;
     gsfix_orbit at;
@@ -213,6 +214,7 @@ static gsf_result web_open_splats(const web_file* file, int width, int height) {
     if (result == GSF_OK) result = orbit_face(&w.ctx, &w.at, &w.splats, width, height, &radius);
     w.desc.near_plane = (float)(0.02 * radius);
     w.desc.antialiased = w.splats.antialiased;
+    memcpy(w.desc.background, w.splats.background, sizeof w.desc.background);
     return result;
 }
 
@@ -228,6 +230,7 @@ static gsf_result web_split(size_t photos) {
 
 static gsf_result web_measure(void) {
     w.psnr = 0.0;
+    w.measured = w.last.iteration;
     for (size_t i = 0; i < w.test_count; i++) {
         const gsf_scene_view* view = w.scene.views + w.test[i];
         gsf_render_output out = {0};
@@ -304,10 +307,10 @@ EMSCRIPTEN_KEEPALIVE const char* web_state(void) {
     const int done = w.stats.stage == GSF_FIX_DONE, training = w.fixer && !done;
     w.text.size = 0;
     gsf_append_text(&w.ctx, &w.text,
-                    "{\"splats\":%zu,\"photos\":%zu,\"heldOut\":%zu,\"iteration\":%d,\"iterations\":%d,\"round\":%d,"
+                    "{\"splats\":%zu,\"photos\":%zu,\"heldOut\":%zu,\"iteration\":%d,\"measured\":%d,\"iterations\":%d,\"round\":%d,"
                     "\"restoring\":%d,\"training\":%d,\"done\":%d,\"threads\":%d,\"kernels\":\"%s\",\"psnr\":",
                     w.last.splats ? w.last.splats : w.splats.count, w.train_count, w.test_count, (int)w.last.iteration,
-                    w.fixer ? (int)w.iterations : 0, (int)w.stats.round,
+                    (int)w.measured, w.fixer ? (int)w.iterations : 0, (int)w.stats.round,
                     w.stats.stage == GSF_FIX_PLAN || w.stats.stage == GSF_FIX_RESTORE, training, w.fixer && done,
                     (int)w.ctx.parallel.worker_count, gsf_describe_cpu_level(w.ctx.cpu_level));
     gsf_append_json_number(&w.ctx, &w.text, w.psnr);

@@ -23,14 +23,14 @@ check() { # COMPILER FLAG...
     head -n 20 "$work/log"
 }
 warnings=(-Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror -fsyntax-only)
-warnings+=(-Wno-misleading-indentation) # in so long a unit, gcc says that it cannot tell
+long=-flarge-source-files # else gcc notes that it cannot tell misleading indentation in so long a unit
 cd "$work"
 check gcc -std=c11 "${warnings[@]}" -Wdouble-promotion unit.c
 check g++ -std=c++20 "${warnings[@]}" unit.cpp
 check clang++-14 -std=c++20 "${warnings[@]}" unit.cpp
-check x86_64-w64-mingw32-gcc -std=c11 "${warnings[@]}" unit.c
-check x86_64-w64-mingw32-gcc -std=gnu17 "${warnings[@]}" unit.c
-check x86_64-w64-mingw32-g++ -std=c++17 "${warnings[@]}" unit.cpp
+check x86_64-w64-mingw32-gcc -std=c11 "${warnings[@]}" $long unit.c
+check x86_64-w64-mingw32-gcc -std=gnu17 "${warnings[@]}" $long unit.c
+check x86_64-w64-mingw32-g++ -std=c++17 "${warnings[@]}" $long unit.cpp
 check aarch64-linux-gnu-gcc -std=c11 "${warnings[@]}" unit.c
 check aarch64-linux-gnu-g++ -std=c++17 "${warnings[@]}" unit.cpp
 check clang-14 --target=aarch64-linux-gnu -std=c11 "${warnings[@]}" -isystem /usr/aarch64-linux-gnu/include unit.c
