@@ -6,12 +6,12 @@
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
            [--pixels 216] [--fit 599] [--groups 1]
 
-   DIR gets a file for each seed in --scenes and --check (mini_data.h), unless it is there already. The network is trained on
-   the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state: what --resume
-   continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes, as do runs
-   with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a file.
-   --pixels: longer side of the photos; --fit: step of the last round, of which there are three. --groups N: the batch is added
-   up in N parts (training.h), which up to N ranks share: with -DGSF_USE_MPI, compiled by mpicc,
+   --scenes and --check: seeds, such as 1001-1040,1055. DIR gets a file for each (mini_data.h), unless it is there already. The
+   network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state:
+   what --resume continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes,
+   as do runs with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a
+   file. --pixels: longer side of the photos; --fit: step of the last round, of which there are three. --groups N: the batch is
+   added up in N parts (training.h), which up to N ranks share: with -DGSF_USE_MPI, compiled by mpicc,
        mpirun -np 2 train_mini ... --groups 2
    writes the bytes of the same command on one rank. OUT.loss.csv and OUT.loss.html: loss of every step, and its curve. */
 #ifndef _POSIX_C_SOURCE
@@ -26,7 +26,11 @@
 #include "mini_batches.h"
 #include "training.h"
 
-typedef struct seeds { uint64_t first, last; } seeds;
+enum { SEED_RANGES = 16 };
+typedef struct seeds { // ranges of them, both ends included
+    int ranges;
+    uint64_t first[SEED_RANGES], last[SEED_RANGES];
+} seeds;
 
 typedef struct options {
     const char *out, *data, *init;
@@ -57,7 +61,17 @@ static double decibels(double square) { return -10.0 * log10(square > 1e-10 ? sq
 
 // ---- data ------------------------------------------------------------------------
 
-static size_t seed_count(seeds s) { return s.last >= s.first && s.first ? (size_t)(s.last - s.first + 1) : 0; }
+static size_t seed_count(const seeds* s) {
+    size_t count = 0;
+    for (int i = 0; i < s->ranges; i++) count += (size_t)(s->last[i] - s->first[i] + 1);
+    return count;
+}
+
+static uint64_t seed_at(const seeds* s, size_t index) {
+    int i = 0;
+    for (; index > s->last[i] - s->first[i]; i++) index -= (size_t)(s->last[i] - s->first[i] + 1);
+    return s->first[i] + index;
+}
 
 static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
     char path[2048];
@@ -81,14 +95,14 @@ static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
 }
 
 static gsf_result open_data(training* t) {
-    t->scene_count = seed_count(t->o.scenes);
-    t->check_count = seed_count(t->o.check);
+    t->scene_count = seed_count(&t->o.scenes);
+    t->check_count = seed_count(&t->o.check);
     const size_t all = t->scene_count + t->check_count;
     t->files = (gsf_nn_weights*)gsf_alloc_zeroed(&t->ctx, all, sizeof *t->files);
     t->scenes = (const gsf_nn_tensor**)gsf_alloc_zeroed(&t->ctx, all, sizeof *t->scenes);
     if (!t->files || !t->scenes) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < all; i++) {
-        const uint64_t seed = i < t->scene_count ? t->o.scenes.first + i : t->o.check.first + (i - t->scene_count);
+        const uint64_t seed = i < t->scene_count ? seed_at(&t->o.scenes, i) : seed_at(&t->o.check, i - t->scene_count);
         const gsf_result result = open_scene(t, i, seed);
         if (result != GSF_OK) return result;
     }
@@ -314,7 +328,7 @@ static gsf_result check(training* t) {
         figures all, good;
         result = check_scene(t, &net, t->scenes[t->scene_count + i], &all, &good);
         if (result != GSF_OK) break;
-        printf("scene %llu: %.2f -> %.2f dB; nearly right: %.2f -> %.2f dB\n", (unsigned long long)(t->o.check.first + i),
+        printf("scene %llu: %.2f -> %.2f dB; nearly right: %.2f -> %.2f dB\n", (unsigned long long)seed_at(&t->o.check, i),
                all.before, all.after, good.before, good.after);
         sum.before += share * all.before, sum.after += share * all.after;
         good_sum.before += share * good.before, good_sum.after += share * good.after;
@@ -337,11 +351,20 @@ static int usage(FILE* to) {
     return to == stdout ? 0 : 2;
 }
 
-static int parse_seeds(const char* text, seeds* out) { // "A-B", "A", or "0" for none
-    char* end;
-    out->first = strtoull(text, &end, 10);
-    out->last = *end == '-' ? strtoull(end + 1, &end, 10) : out->first;
-    return end != text && !*end && out->last >= out->first && out->last < 1000000000 && out->last - out->first < 10000;
+static int parse_seeds(const char* text, seeds* out) { // "A-B,C,D-E" or "0" for none
+    memset(out, 0, sizeof *out);
+    if (strcmp(text, "0") == 0) return 1;
+    for (;;) {
+        char* end;
+        const uint64_t first = strtoull(text, &end, 10), last = *end == '-' ? strtoull(end + 1, &end, 10) : first;
+        if (end == text || !first || last < first || last >= 1000000000 || last - first >= 10000 || out->ranges == SEED_RANGES)
+            return 0;
+        out->first[out->ranges] = first;
+        out->last[out->ranges++] = last;
+        if (!*end) return 1;
+        if (*end != ',') return 0;
+        text = end + 1;
+    }
 }
 
 static int parse_options(int argc, char** argv, options* o) {
@@ -377,7 +400,7 @@ static int parse_options(int argc, char** argv, options* o) {
             else return 0;
         }
     }
-    return o->out && o->data && seed_count(o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
+    return o->out && o->data && seed_count(&o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
            training_is_power(o->groups) && o->batch % o->groups == 0 &&
            o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 &&
            2 * o->pixels / 3 >= o->crop;
@@ -385,7 +408,7 @@ static int parse_options(int argc, char** argv, options* o) {
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1001, 1060}, {1061, 1064}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1, 1e-3};
+    t.o = (options){NULL, NULL, NULL, {1, {1001}, {1060}}, {1, {1061}, {1064}}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1, 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     t.ctx.parallel.worker_count = t.o.threads;

@@ -19,6 +19,11 @@ grep -q "^mean: " one.txt || fail "no figures"
 cmp one three || fail "weights depend on the number of threads"
 cmp one.state three.state || fail "state depends on the number of threads"
 cmp one.txt three.txt || fail "figures depend on the number of threads"
+"$train" twice "${short[@]}" --scenes 4,4-4 > /dev/null
+cmp one twice || fail "a scene given twice gives other samples"
+for seeds in "" 4, 4-3 x 4-x; do
+    "$train" none "${short[@]}" --scenes "$seeds" > /dev/null 2>&1 && fail "--scenes '$seeds' is accepted"
+done
 
 "$train" killed "${short[@]}" --threads 1 > /dev/null & # until it has written a state, then kill -9
 pid=$!
