@@ -2765,6 +2765,8 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "io: set both functions or neither");
     if (ctx->parallel.for_fn && ctx->parallel.worker_count < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "parallel: worker_count is %d", ctx->parallel.worker_count);
+    if (!ctx->parallel.for_fn && ctx->parallel.worker_count && !ctx->threads)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "parallel: worker_count without for_fn; `threads` sets OpenMP's");
     if (ctx->threads < 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "threads is %d", ctx->threads);
     if (!ctx->allocator.alloc_fn) {
         ctx->allocator.alloc_fn = gsf__malloc;

@@ -618,7 +618,8 @@ typedef struct gsf_nn_mini_desc {
 
 /* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
    the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains.
-   It takes frames of any size and any number. A host embeds it in three lines:
+   It takes frames of any size and any number. Weights are f32, bf16, f16, or 8-bit integers with a factor per output (NAME.weight
+   as I8 with NAME.weight_scale, as compressed-tensors has them). A host embeds it in three lines:
        gsf_nn_mini_desc desc = {0};
        desc.data = bytes, desc.size = byte_count;    // or desc.path
        gsf_nn_make_mini(&ctx, &desc, &restorer);
@@ -14957,6 +14958,7 @@ typedef struct gsf__mini_level {
 
 typedef struct gsf__mini { // an open network
     gsf_nn_weights weights;
+    float* widened;                          // values of those tensors that the file has as 8-bit integers
     int64_t hidden, features, shared;        // channels: of a reference's first layer, of its features, of its head
     int64_t width[GSF__MINI_LEVELS];
     int32_t blocks[GSF__MINI_LEVELS];        // of gsf__mini_level.in
@@ -15011,6 +15013,45 @@ static int64_t gsf__mini_size_of(const gsf_nn_weights* weights, const char* name
     return t && t->rank == 4 && t->shape[0] <= GSF__MINI_CHANNELS ? t->shape[0] : 0;
 }
 
+// Turns NAME (out, ...) in 8-bit integers and NAME_scale (out) or (out, 1) into floats.
+static gsf_result gsf__mini_widen_tensor(gsf_context* ctx, const gsf_nn_weights* weights, gsf_nn_tensor* t, float* out) {
+    char name[64];
+    snprintf(name, sizeof name, "%s_scale", t->name);
+    const gsf_nn_tensor* scale = gsf_nn_find_tensor(weights, name);
+    if (!scale || scale->dtype != GSF_NN_F32 || t->rank < 1 || scale->count != t->shape[0])
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no tensor %s with an F32 factor per output of %s", weights->name,
+                        gsf__nn_show(name).text, gsf__nn_show(t->name).text);
+    const int64_t each = scale->count ? t->count / scale->count : 0;
+    gsf_nn_convert_tensor(t, 0, t->count, out);
+    for (int64_t o = 0; o < scale->count; o++) {
+        float factor;
+        gsf_nn_convert_tensor(scale, o, 1, &factor);
+        for (int64_t i = o * each; i < (o + 1) * each; i++) out[i] *= factor;
+    }
+    t->data = out;
+    t->dtype = GSF_NN_F32;
+    return GSF_OK;
+}
+
+// After this, no tensor of net->weights is 8-bit, and there are no factors.
+static gsf_result gsf__mini_widen(gsf_context* ctx, gsf__mini* net) {
+    gsf_nn_weights* w = &net->weights;
+    size_t total = 0, kept = 0;
+    for (size_t i = 0; i < w->tensor_count; i++) total += w->tensors[i].dtype == GSF_NN_I8 ? (size_t)w->tensors[i].count : 0;
+    if (total == 0) return GSF_OK;
+    float* to = net->widened = (float*)gsf_alloc(ctx, total, sizeof(float));
+    if (!to) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < w->tensor_count; i++) {
+        if (w->tensors[i].dtype != GSF_NN_I8) continue;
+        GSF__TRY(gsf__mini_widen_tensor(ctx, w, w->tensors + i, to));
+        to += w->tensors[i].count;
+    }
+    for (size_t i = 0; i < w->tensor_count; i++)
+        if (!strstr(w->tensors[i].name, ".weight_scale")) w->tensors[kept++] = w->tensors[i];
+    w->tensor_count = kept;
+    return GSF_OK;
+}
+
 // Finds the tensors of net->weights, from which all sizes follow.
 static gsf_result gsf__mini_bind(gsf_context* ctx, gsf__mini* net) {
     gsf__nn_loader loader;
@@ -15033,6 +15074,7 @@ static gsf_result gsf__mini_bind(gsf_context* ctx, gsf__mini* net) {
 
 static void gsf__mini_close(gsf_context* ctx, gsf__mini* net) {
     gsf_nn_destroy_weights(ctx, &net->weights);
+    gsf_free(ctx, net->widened);
     memset(net, 0, sizeof *net);
 }
 
@@ -15041,6 +15083,7 @@ static gsf_result gsf__mini_open(gsf_context* ctx, const char* path, const void*
     memset(net, 0, sizeof *net);
     gsf_result result = data ? gsf_nn_parse_weights(ctx, path ? path : "mini", data, size, &net->weights)
                              : gsf_nn_load_weights(ctx, path, NULL, &net->weights);
+    if (!result) result = gsf__mini_widen(ctx, net);
     if (!result) result = gsf__mini_bind(ctx, net);
     if (result) gsf__mini_close(ctx, net);
     return result;

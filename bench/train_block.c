@@ -120,7 +120,7 @@ int main(int argc, char** argv) {
         fprintf(stderr, "usage: train_block MODEL OUT [--frames F] [--height H] [--width W] [--references R] [--runs N]\n");
         return 2;
     }
-    r.ctx.parallel.worker_count = (int32_t)values[5];
+    r.ctx.threads = (int32_t)values[5];
     gsf_result result = gsf_init_context(&r.ctx);
     if (result == GSF_OK) result = open_run(&r, argv[1], values);
     for (int64_t i = 0; i < values[4] && result == GSF_OK; i++) {

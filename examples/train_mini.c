@@ -4,14 +4,15 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
-           [--pixels 216] [--fit 599] [--groups 1]
+           [--pixels 216] [--fit 599] [--groups 1] [--int8]
 
    --scenes and --check: seeds, such as 1001-1040,1055. DIR gets a file for each (mini_data.h), unless it is there already. The
-   network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16. OUT.state:
-   what --resume continues from, written every --save-every steps; a run that was killed and resumed ends with the same bytes,
-   as do runs with other numbers of threads. --quick: 4000 steps, ten minutes on one core. --init starts from the weights of a
-   file. --pixels: longer side of the photos; --fit: step of the last round, of which there are three. --groups N: the batch is
-   added up in N parts (training.h), which up to N ranks share: with -DGSF_USE_MPI, compiled by mpicc,
+   network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16 or, with
+   --int8, all kernels in 8-bit integers. OUT.state: what --resume continues from, written every --save-every steps; a run that
+   was killed and resumed ends with the same bytes, as do runs with other numbers of threads. --quick: 4000 steps, ten minutes
+   on one core. --init starts from the weights of a file. --pixels: longer side of the photos; --fit: step of the last round, of
+   which there are three. --groups N: the batch is added up in N parts (training.h), which up to N ranks share: with
+   -DGSF_USE_MPI, compiled by mpicc,
        mpirun -np 2 train_mini ... --groups 2
    writes the bytes of the same command on one rank. OUT.loss.csv and OUT.loss.html: loss of every step, and its curve. */
 #ifndef _POSIX_C_SOURCE
@@ -35,7 +36,7 @@ typedef struct seeds { // ranges of them, both ends included
 typedef struct options {
     const char *out, *data, *init;
     seeds scenes, check;
-    int steps, batch, crop, save_every, threads, resume, make_only, pixels, fit, groups;
+    int steps, batch, crop, save_every, threads, resume, make_only, int8, pixels, fit, groups;
     uint64_t seed;
     double rate;
 } options;
@@ -166,21 +167,66 @@ static gsf_result save_state(training* t) {
     return gsf__nn_save_params(&t->ctx, &t->params, GSF__NN_SAVE_STATE, path);
 }
 
-// The moving average, rounded to bfloat16.
+typedef struct narrowing { // tensors of floats on their way into a file
+    gsf_nn_tensor* tensors;    // that it gets
+    size_t count;
+    unsigned char *memory, *at; // for their values and names; the next free byte
+} narrowing;
+
+static void* narrow_take(narrowing* n, size_t bytes) {
+    void* const p = n->at;
+    n->at += (bytes + 7) / 8 * 8;
+    return p;
+}
+
+static void narrow_add(narrowing* n, const gsf_nn_tensor* like, const char* name, gsf_nn_dtype dtype, const void* data) {
+    gsf_nn_tensor* t = n->tensors + n->count++;
+    *t = *like;
+    t->name = name;
+    t->dtype = dtype;
+    t->data = data;
+}
+
+static void narrow_to_bf16(narrowing* n, const gsf_nn_tensor* t, const float* values) {
+    uint16_t* to = (uint16_t*)narrow_take(n, (size_t)t->count * sizeof *to);
+    for (int64_t i = 0; i < t->count; i++) to[i] = gsf__float_to_bf16(values[i]);
+    narrow_add(n, t, t->name, GSF_NN_BF16, to);
+}
+
+// 8-bit integers, and a factor per output that makes its largest weight 127.
+static void narrow_to_int8(narrowing* n, const gsf_nn_tensor* t, const float* values) {
+    const int64_t outputs = t->shape[0], each = t->count / outputs;
+    const gsf_nn_tensor factors = gsf_nn_wrap_tensor("", NULL, 1, &outputs);
+    const size_t room = strlen(t->name) + sizeof "_scale";
+    char* name = (char*)narrow_take(n, room);
+    float* scale = (float*)narrow_take(n, (size_t)outputs * sizeof *scale);
+    int8_t* to = (int8_t*)narrow_take(n, (size_t)t->count);
+    snprintf(name, room, "%s_scale", t->name);
+    for (int64_t o = 0; o < outputs; o++, values += each) {
+        float most = 0.0f;
+        for (int64_t i = 0; i < each; i++) most = fmaxf(most, fabsf(values[i]));
+        scale[o] = most / 127.0f;
+        for (int64_t i = 0; i < each; i++) to[o * each + i] = (int8_t)(most > 0.0f ? lrintf(values[i] * 127.0f / most) : 0);
+    }
+    narrow_add(n, t, t->name, GSF_NN_I8, to);
+    narrow_add(n, &factors, name, GSF_NN_F32, scale);
+}
+
+// The moving average, in bfloat16 or, with --int8, kernels in 8-bit integers.
 static gsf_result save_network(training* t) {
     const gsf_nn_weights* w = &t->net.weights;
-    gsf_nn_tensor* all = (gsf_nn_tensor*)gsf_alloc(&t->ctx, w->tensor_count, sizeof *all);
-    uint16_t* values = (uint16_t*)gsf_alloc(&t->ctx, (size_t)t->params.count, sizeof *values);
-    gsf_result result = all && values ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    for (int64_t i = 0; result == GSF_OK && i < t->params.count; i++) values[i] = gsf__float_to_bf16(t->params.average[i]);
+    narrowing n = {NULL, 0, NULL, NULL};
+    n.tensors = (gsf_nn_tensor*)gsf_alloc(&t->ctx, 2 * w->tensor_count, sizeof *n.tensors);
+    n.memory = n.at = (unsigned char*)gsf_alloc(&t->ctx, 2 * (size_t)t->params.count + 4096 * w->tensor_count, 1);
+    gsf_result result = n.tensors && n.memory ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; result == GSF_OK && i < w->tensor_count; i++) {
-        all[i] = w->tensors[i];
-        all[i].data = values + t->params.at[i];
-        all[i].dtype = GSF_NN_BF16;
+        const float* values = t->params.average + t->params.at[i];
+        if (t->o.int8 && w->tensors[i].rank == 4) narrow_to_int8(&n, w->tensors + i, values);
+        else narrow_to_bf16(&n, w->tensors + i, values);
     }
-    if (result == GSF_OK) result = gsf_nn_save_tensors(&t->ctx, t->o.out, all, w->tensor_count);
-    gsf_free(&t->ctx, all);
-    gsf_free(&t->ctx, values);
+    if (result == GSF_OK) result = gsf_nn_save_tensors(&t->ctx, t->o.out, n.tensors, n.count);
+    gsf_free(&t->ctx, n.tensors);
+    gsf_free(&t->ctx, n.memory);
     return result;
 }
 
@@ -346,7 +392,7 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
                 "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1] [--int8]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -373,6 +419,7 @@ static int parse_options(int argc, char** argv, options* o) {
         if (strcmp(name, "--quick") == 0) o->steps = 4000;
         else if (strcmp(name, "--resume") == 0) o->resume = 1;
         else if (strcmp(name, "--make-only") == 0) o->make_only = 1;
+        else if (strcmp(name, "--int8") == 0) o->int8 = 1;
         else if (name[0] != '-') {
             if (o->out) return 0;
             o->out = name;
@@ -408,10 +455,11 @@ static int parse_options(int argc, char** argv, options* o) {
 
 int main(int argc, char** argv) {
     static training t;
-    t.o = (options){NULL, NULL, NULL, {1, {1001}, {1060}}, {1, {1061}, {1064}}, 14000, 8, 96, 500, 0, 0, 0, 216, 599, 1, 1, 1e-3};
+    t.o = (options){.scenes = {1, {1001}, {1060}}, .check = {1, {1061}, {1064}}, .steps = 14000, .batch = 8, .crop = 96,
+                    .save_every = 500, .pixels = 216, .fit = 599, .groups = 1, .seed = 1, .rate = 1e-3};
     if (argc == 2 && strcmp(argv[1], "--help") == 0) return usage(stdout);
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
-    t.ctx.parallel.worker_count = t.o.threads;
+    t.ctx.threads = t.o.threads;
     gsf_result result = gsf_init_context(&t.ctx);
     t.ranks = training_begin(&t.ctx, &argc, &argv);
     if (result == GSF_OK && t.ranks.rank == 0) result = open_data(&t); // it makes what is missing

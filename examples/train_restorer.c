@@ -869,7 +869,7 @@ int main(int argc, char** argv) {
     if (!parse_options(argc, argv, &t.o)) return usage(stderr);
     cache = join(t.o.out ? t.o.out : ".", "cache");
     if (!t.o.cache) t.o.cache = cache.text;
-    t.ctx.parallel.worker_count = t.o.threads;
+    t.ctx.threads = t.o.threads;
     gsf_result result = gsf_init_context(&t.ctx);
     t.ranks = training_begin(&t.ctx, &argc, &argv);
     if (result == GSF_OK) result = run(&t);

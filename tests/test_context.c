@@ -15,6 +15,10 @@ static void test_bad_hooks(void) {
     CHECK_RESULT(&ctx, gsf_init_context(&ctx), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(strstr(ctx.error, "threads") != NULL);
     test_context_zero(&ctx);
+    ctx.parallel.worker_count = 2; // of what?
+    CHECK_RESULT(&ctx, gsf_init_context(&ctx), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK(strstr(ctx.error, "for_fn") != NULL);
+    test_context_zero(&ctx);
     ctx.allocator.user = &ctx;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     CHECK_RESULT(&ctx, gsf_init_context(NULL), GSF_ERROR_INVALID_ARGUMENT);

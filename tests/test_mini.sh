@@ -49,6 +49,10 @@ fi
 "$train" learned "${data[@]}" --batch 4 --steps 150 --rate 0.003 --threads 1 > learned.txt
 awk '/^mean: / { if ($4 < $2 + 0.3) exit 1 }' learned.txt || fail "it has learned nothing: $(tail -1 learned.txt)"
 
+"$train" narrow "${data[@]}" --batch 4 --steps 150 --rate 0.003 --threads 1 --int8 > narrow.txt
+[ $((3 * $(stat -c %s narrow))) -lt $((2 * $(stat -c %s learned))) ] || fail "8-bit weights are no smaller"
+paste -d' ' learned.txt narrow.txt | awk '/^mean: / { exit ($4 - $10) ^ 2 > 0.05 ^ 2 }' || fail "8-bit weights: $(cat narrow.txt)"
+
 scene=data/scenes/4
 for threads in 1 2; do
     "$gsfix" fix "$scene" --out "fix$threads" --views 3 --iterations 40 --init tracks --restorer mini:learned --filtered \

@@ -549,6 +549,99 @@ static void test_restorer(gsf_context* ctx) {
     gsf_free(ctx, bytes);
 }
 
+// Kernels of a network in 8-bit integers, with a factor per output. Returns the number of tensors.
+static size_t narrow(const gsf_nn_weights* w, gsf_nn_tensor* out, signed char* values, float* scales, char (*names)[64]) {
+    size_t count = 0;
+    for (size_t i = 0; i < w->tensor_count; i++) {
+        const gsf_nn_tensor* t = w->tensors + i;
+        out[count++] = *t;
+        if (t->rank != 4) continue;
+        const int64_t each = t->count / t->shape[0];
+        for (int64_t o = 0; o < t->shape[0]; o++) {
+            scales[o] = 1e-3f;
+            for (int64_t k = o * each; k < (o + 1) * each; k++)
+                scales[o] = fmaxf(scales[o], fabsf(((const float*)t->data)[k]) / 127.0f);
+            for (int64_t k = o * each; k < (o + 1) * each; k++)
+                values[k] = (signed char)lrintf(((const float*)t->data)[k] / scales[o]);
+        }
+        out[count - 1].data = values;
+        out[count - 1].dtype = GSF_NN_I8;
+        snprintf(names[i], sizeof names[i], "%s_scale", t->name);
+        out[count++] = gsf_nn_wrap_tensor(names[i], scales, 1, t->shape);
+        values += t->count;
+        scales += t->shape[0];
+    }
+    return count;
+}
+
+static void test_int8(gsf_context* ctx) {
+    enum { TENSORS = 80 };
+    static signed char values[20000];
+    static float scales[1000];
+    static char names[TENSORS][64];
+    static clip exact, near;
+    static float random[20000];
+    gsf_nn_tensor tensors[2 * TENSORS];
+    gsf__mini net, narrowed, sizes = tiny();
+    CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 5, made_path()));
+    if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
+    size_t weights = 0, outputs = 0, worst = 0;
+    for (size_t i = 0; i < sizeof random / sizeof *random; i++) random[i] = (float)test_random_in(&seed, -0.3, 0.3);
+    for (size_t i = 0; i < net.weights.tensor_count; i++) { // a new network's heads are zero
+        gsf_nn_tensor* t = net.weights.tensors + i;
+        if (t->rank != 4) continue;
+        t->data = random + weights;
+        weights += (size_t)t->count;
+        outputs += (size_t)t->shape[0];
+    }
+    if (!CHECK(net.weights.tensor_count <= TENSORS && weights <= sizeof values && outputs <= sizeof scales / sizeof *scales)) return;
+    const size_t count = narrow(&net.weights, tensors, values, scales, names);
+    for (int fault = 0; fault < 4; fault++) { // none; a factor less; none; of another type
+        gsf_nn_tensor* scale = tensors;
+        while (!strstr(scale->name, "_scale")) scale++;
+        const gsf_nn_tensor kept = *scale;
+        if (fault == 1) scale->count = --scale->shape[0];
+        if (fault == 2) scale->name = "other";
+        if (fault == 3) scale->dtype = GSF_NN_I32;
+        CHECK_OK(ctx, gsf_nn_save_tensors(ctx, made_path(), tensors, count));
+        *scale = kept;
+        CHECK_RESULT(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &narrowed), fault ? GSF_ERROR_FORMAT : GSF_OK);
+        if (fault) CHECK(strstr(ctx->error, kept.name) != NULL);
+        if (fault) continue;
+        CHECK(narrowed.weights.tensor_count == net.weights.tensor_count);
+        const signed char* q = values;
+        const float* s = scales;
+        for (size_t i = 0; i < net.weights.tensor_count; i++) {
+            const gsf_nn_tensor *a = net.weights.tensors + i, *b = narrowed.weights.tensors + i;
+            if (!CHECK(strcmp(a->name, b->name) == 0 && a->count == b->count && b->dtype == GSF_NN_F32)) break;
+            if (a->rank != 4) continue;
+            for (int64_t k = 0; k < a->count; k++)
+                worst += ((const float*)b->data)[k] != (float)q[k] * s[k / (a->count / a->shape[0])];
+            q += a->count;
+            s += a->shape[0];
+        }
+        CHECK(worst == 0);
+        gsf__mini_close(ctx, &narrowed);
+    }
+    float* const to = (float*)(void*)&exact;
+    for (size_t i = 0; i < sizeof exact / sizeof *to; i++) to[i] = (float)test_random_in(&seed, 0.1, 1.0);
+    near = exact;
+    for (int narrow_file = 1; narrow_file >= 0; narrow_file--) {
+        gsf_restorer mini;
+        gsf_nn_mini_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.path = made_path();
+        CHECK_OK(ctx, gsf_nn_save_tensors(ctx, made_path(), narrow_file ? tensors : net.weights.tensors,
+                                          narrow_file ? count : net.weights.tensor_count));
+        CHECK_OK(ctx, gsf_nn_make_mini(ctx, &desc, &mini));
+        run_restorer(ctx, &mini, narrow_file ? &near : &exact, GSF_OK, 1);
+        gsf_destroy_restorer(ctx, &mini);
+    }
+    CHECK(memcmp(near.out, exact.out, sizeof near.out) != 0);
+    for (int i = 0; i < 3 * PIXELS; i++) CHECK_NEAR((double)near.out[i], (double)exact.out[i], 0.01);
+    gsf__mini_close(ctx, &net);
+}
+
 static void test_memory(void) {
     static clip c;
     counter count;
@@ -606,6 +699,7 @@ int main(void) {
     test_start(&ctx);
     test_gate(&ctx);
     test_restorer(&ctx);
+    test_int8(&ctx);
     test_memory();
     return test_report();
 }
