@@ -618,8 +618,8 @@ typedef struct gsf_nn_mini_desc {
 
 /* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
    the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains.
-   It takes frames of any size and any number. Weights are f32, bf16, f16, or 8-bit integers with a factor per output (NAME.weight
-   as I8 with NAME.weight_scale, as compressed-tensors has them). A host embeds it in three lines:
+   It takes frames of any size and any number. Weights are f32, bf16, f16, or 8-bit integers with a factor per output:
+   NAME.weight as I8 with NAME.weight_scale, the layout of compressed-tensors. A host embeds it in three lines:
        gsf_nn_mini_desc desc = {0};
        desc.data = bytes, desc.size = byte_count;    // or desc.path
        gsf_nn_make_mini(&ctx, &desc, &restorer);

@@ -594,7 +594,8 @@ static void test_int8(gsf_context* ctx) {
         weights += (size_t)t->count;
         outputs += (size_t)t->shape[0];
     }
-    if (!CHECK(net.weights.tensor_count <= TENSORS && weights <= sizeof values && outputs <= sizeof scales / sizeof *scales)) return;
+    if (!CHECK(net.weights.tensor_count <= TENSORS && weights <= sizeof values)) return;
+    if (!CHECK(outputs <= sizeof scales / sizeof *scales)) return;
     const size_t count = narrow(&net.weights, tensors, values, scales, names);
     for (int fault = 0; fault < 4; fault++) { // none; a factor less; none; of another type
         gsf_nn_tensor* scale = tensors;
