@@ -135,7 +135,7 @@ static int has_ended(gsf_context* ctx, gsfix_process* p, int pause, gsf_result* 
 
 static ptrdiff_t feed_some(gsfix_process* p, const char* data, size_t size) { // -1: nobody reads
     DWORD taken = 0;
-    if (!WriteFile((HANDLE)p->input, data, (DWORD)(size < FEED_BLOCK ? size : FEED_BLOCK), &taken, NULL)) return -1;
+    if (!WriteFile((HANDLE)p->input, data, (DWORD)(size < FEED_BLOCK ? size : (size_t)FEED_BLOCK), &taken, NULL)) return -1;
     return (ptrdiff_t)taken;
 }
 
@@ -295,7 +295,7 @@ static int has_ended(gsf_context* ctx, gsfix_process* p, int pause, gsf_result* 
 
 static ptrdiff_t feed_some(gsfix_process* p, const char* data, size_t size) { // -1: nobody reads
     void (*const before)(int) = signal(SIGPIPE, SIG_IGN);
-    const ssize_t n = write((int)p->input, data, size < FEED_BLOCK ? size : FEED_BLOCK);
+    const ssize_t n = write((int)p->input, data, size < FEED_BLOCK ? size : (size_t)FEED_BLOCK);
     const int reason = errno;
     signal(SIGPIPE, before);
     return n >= 0 ? (ptrdiff_t)n : reason == EAGAIN || reason == EINTR ? 0 : -1;
