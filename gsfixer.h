@@ -41,7 +41,7 @@
                ctx->error and passed to the log hook. On error, outputs are zeroed or unchanged and nothing leaks.
    MEMORY      All memory comes from the context's allocator. The caller that makes an object destroys it with the same
                context.
-   STACK       No function's own frame is above 32 KB (-O2: 31 KB in a convolution, else below 16 KB; -O0: 31 KB), so threads
+   STACK       No function's own frame is above 16 KB with -O2 or -O3, nor above 17 KB with -O0 (tests/stack.sh), so threads
                with 256 KB are enough.
    PLATFORMS   64-bit Linux, Windows (MinGW-w64; file names are UTF-8 and may be longer than 260 characters), macOS, Arm with
                NEON, WebAssembly with or without -msimd128. The compiler of Visual Studio gets the scalar kernels, clang-cl

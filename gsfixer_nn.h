@@ -6376,41 +6376,37 @@ static int64_t gsf__conv_segments(const gsf__conv_job* job) {
 
 enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
 
-// tiles (panels, rows, 30, 16) += the products of all kernel rows with one or two panels of outputs.
-static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, int64_t x0, int64_t columns, int64_t panels,
-                          const float* b, float* tile) {
+// Rows of a segment: pixels (y0 + first ...) x (x0 ...).
+typedef struct gsf__conv_band { int64_t y0, first, rows, x0, columns; } gsf__conv_band;
+
+// tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels of outputs.
+static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, int64_t panels, const float* b, float* tile,
+                          int64_t next) {
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
                 const int64_t k = gsf__least(job->k - k0, GSF__CONV_K);
-                for (int64_t r = 0; r < rows; r++) {
-                    const int64_t y = (y0 + r) * job->stride + kh - job->pad;
+                for (int64_t r = 0; r < band->rows; r++) {
+                    const int64_t row = band->first + r, y = (band->y0 + row) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
-                    const float* a = job->in[kt] + y * job->in_stride + job->origin + x0 * job->step + k0;
-                    const float* ahead = b + (GSF__CONV_N + r * GSF__CONV_SHARE) * k; // the rows share the prefetching
+                    const float* a = job->in[kt] + y * job->in_stride + job->origin + band->x0 * job->step + k0;
+                    const float* ahead = b + (GSF__CONV_N + row * GSF__CONV_SHARE) * k; // the rows share the prefetching
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
                     if (panels == 2)
-                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE, ahead);
-                    else job->kernels->multiply(a, job->step, columns, b, k, c, ahead);
+                        job->kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, c, next, ahead);
+                    else job->kernels->multiply(a, job->step, band->columns, b, k, c, ahead);
                 }
                 b += k * GSF__CONV_N;
             }
 }
 
-// Writes a tile to outputs n0 ... of its pixels; adds its values and their squares to `partial` (may be NULL).
-static void gsf__conv_store(const gsf__conv_job* job, const float* tile, int64_t y0, int64_t rows, int64_t x0,
-                            int64_t columns, int64_t n0, double* partial) {
-    const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
-    double sums[2 * GSF__CONV_N];
-    memset(sums, 0, sizeof sums);
-    for (int64_t r = 0; r < rows; r++)
-        job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, columns, n, job->accumulate,
-                            job->out + (y0 + r) * job->out_row + x0 * job->ldo + n0, job->ldo, sums);
-    for (int64_t i = 0; partial && i < n; i++) {
-        const int64_t group = (n0 + i) / (job->outputs / job->groups);
-        partial[2 * group] += sums[i];
-        partial[2 * group + 1] += sums[GSF__CONV_N + i];
-    }
+// Writes a tile to outputs n0 ... of its pixels; adds its values and their squares to `sums` (2, 16).
+static void gsf__conv_store(const gsf__conv_job* job, const gsf__conv_band* band, const float* tile, int64_t n0,
+                            double* sums) {
+    const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N), y = band->y0 + band->first;
+    for (int64_t r = 0; r < band->rows; r++)
+        job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, band->columns, n, job->accumulate,
+                            job->out + (y + r) * job->out_row + band->x0 * job->ldo + n0, job->ldo, sums);
 }
 
 static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
@@ -6418,20 +6414,32 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
     const int64_t across = gsf__conv_columns(job);
     const int64_t y0 = (int64_t)segment / across * GSF__CONV_ROWS, x0 = (int64_t)segment % across * GSF__CONV_COLUMNS;
     const int64_t rows = gsf__least(job->height - y0, GSF__CONV_ROWS);
-    const int64_t columns = gsf__least(job->width - x0, GSF__CONV_COLUMNS);
+    gsf__conv_band band = {y0, 0, 0, x0, gsf__least(job->width - x0, GSF__CONV_COLUMNS)};
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
-    float tiles[2 * GSF__CONV_TILE];
+    float tiles[GSF__CONV_TILE]; // of one panel, or of half the rows for two: any more is too much for small stacks
+    double sums[2][2 * GSF__CONV_N];
     (void)worker;
     if (partial) memset(partial, 0, (size_t)job->groups * 2 * sizeof(double));
     for (int64_t n0 = 0, panels; n0 < job->outputs; n0 += panels * GSF__CONV_N) {
         const float* b = job->packed + n0 / GSF__CONV_N * job->panel; // bias, then weights
         panels = job->kernels->multiply_two && job->outputs - n0 > GSF__CONV_N ? 2 : 1;
-        for (int64_t p = 0; p < panels; p++)
-            for (int64_t i = 0; i < rows * GSF__CONV_COLUMNS; i++)
-                memcpy(tiles + p * GSF__CONV_TILE + i * GSF__CONV_N, b + p * job->panel, GSF__CONV_N * sizeof(float));
-        gsf__conv_sum(job, y0, rows, x0, columns, panels, b + GSF__CONV_N, tiles);
-        for (int64_t p = 0; p < panels; p++)
-            gsf__conv_store(job, tiles + p * GSF__CONV_TILE, y0, rows, x0, columns, n0 + p * GSF__CONV_N, partial);
+        const int64_t next = GSF__CONV_TILE / panels;
+        memset(sums, 0, sizeof sums);
+        for (band.first = 0; band.first < rows; band.first += band.rows) {
+            band.rows = gsf__least(rows - band.first, GSF__CONV_ROWS / panels);
+            for (int64_t p = 0; p < panels; p++)
+                for (int64_t i = 0; i < band.rows * GSF__CONV_COLUMNS; i++)
+                    memcpy(tiles + p * next + i * GSF__CONV_N, b + p * job->panel, GSF__CONV_N * sizeof(float));
+            gsf__conv_sum(job, &band, panels, b + GSF__CONV_N, tiles, next);
+            for (int64_t p = 0; p < panels; p++)
+                gsf__conv_store(job, &band, tiles + p * next, n0 + p * GSF__CONV_N, sums[p]);
+        }
+        const int64_t n = gsf__least(job->outputs - n0, panels * GSF__CONV_N);
+        for (int64_t i = 0; partial && i < n; i++) {
+            const int64_t group = (n0 + i) / (job->outputs / job->groups);
+            partial[2 * group] += sums[i / GSF__CONV_N][i % GSF__CONV_N];
+            partial[2 * group + 1] += sums[i / GSF__CONV_N][GSF__CONV_N + i % GSF__CONV_N];
+        }
     }
 }
 

@@ -184,6 +184,10 @@ static const option_spec option_specs[] = {
      "with --depth: also write OUT/depth/NAME.exr (float32, scene units), or OUT/depth16/NAME.png, 16-bit numbers that the\n"
      "factor in OUT/depth16/scale.json turns into scene units; 0 where there is nothing"},
     {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also write OUT/alpha/NAME.png"},
+    {"--video", TEXT, AT(video), 0, 0, "FILE", "fix render restore",
+     "also write the frames as a video (fix: the repaired ones, window by window). FILE.mp4 and .webm are made by ffmpeg, if\n"
+     "it is in PATH; .png, an animated PNG, lossless and large, and .html, a page that plays them, need nothing"},
+    {"--fps", WHOLE, AT(fps), 1, 240, "N", "fix render restore", "frames per second of --video (default 24)"},
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
      "keep the points that a training view sees by ray (embree), by track (tracks) or by either (both, the default)"},
     {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate|spread", "path", "kind of path (default reference)"},
@@ -879,7 +883,7 @@ static gsf_result save_depth_16(gsfix_app* app, const gsf_image* depth, const ch
 
 // Writes one image (and depth, alpha) to the output folders; buffers grow to the size of the largest camera.
 static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const gsf_splats* splats, const gsf_camera* camera,
-                             const gsf_render_desc* desc, const char* name) {
+                             const gsf_render_desc* desc, const char* name, gsfix_video* video) {
     gsf_context* ctx = &app->ctx;
     const char* out = app->o.out;
     gsf_render_output images = {0};
@@ -891,6 +895,7 @@ static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const g
         result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.alpha);
     if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, desc, &images);
     if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", out, name).s, &images.color);
+    if (result == GSF_OK) result = gsfix_add_frame(video, &images.color);
     if (result == GSF_OK && app->o.depth) {
         result = gsfix_save_npy(ctx, gsfix_pathf("%s/depth/%s.npy", out, name).s, &images.depth);
         if (result == GSF_OK) result = gsfix_color_depth(ctx, &images.depth, &picture);
@@ -926,6 +931,7 @@ static gsf_result open_render_out(gsfix_app* app, const gsf_scene* scene, size_t
     }
     if (result == GSF_OK && depth_is_png(app)) result = gsfix_claim(app, "depth16/scale.json");
     if (result == GSF_OK) result = gsfix_open_out(app);
+    if (result == GSF_OK) result = gsfix_claim_file(app, app->o.video);
     return result == GSF_OK ? gsfix_remove_stale(app) : result;
 }
 
@@ -972,16 +978,30 @@ static void close_filter(gsfix_app* app, render_filter* f) {
 }
 
 // Replaces a render by what the restorer makes of it.
-static gsf_result filter_one(gsfix_app* app, const render_filter* f, const gsf_camera* camera, const char* name) {
+static gsf_result filter_one(gsfix_app* app, const render_filter* f, const gsf_camera* camera, const char* name,
+                             gsfix_video* video) {
     gsf_context* ctx = &app->ctx;
     gsf_image color, confidence = {0};
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
     if (result == GSF_OK) result = gsf_splat_restore_views(ctx, f->fixer, camera, 1, &color, &confidence);
     if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name).s, &color);
+    if (result == GSF_OK) result = gsfix_add_frame(video, &color);
     gsf_destroy_image(ctx, &color);
     gsf_destroy_image(ctx, &confidence);
     return result;
+}
+
+// cameras: `stride` bytes apart.
+static gsf_result begin_render_video(gsfix_app* app, const gsf_camera* cameras, size_t stride, size_t count,
+                                     gsfix_video** out) {
+    int64_t width = 0, height = 0;
+    for (size_t i = 0; i < count; i++) {
+        const gsf_camera* camera = (const gsf_camera*)((const char*)cameras + i * stride);
+        if (camera->width > width) width = camera->width;
+        if (camera->height > height) height = camera->height;
+    }
+    return gsfix_begin_video(app, width, height, count, out);
 }
 
 static gsf_result render_all(gsfix_app* app, const float* background) { // NULL: that of the splats
@@ -991,6 +1011,7 @@ static gsf_result render_all(gsfix_app* app, const float* background) { // NULL:
     gsf_camera* path = NULL;
     gsf_rasterizer* rasterizer = NULL;
     render_filter filter = {0};
+    gsfix_video* video = NULL;
     const int filtered = app->o.restorer && strcmp(app->o.restorer, "none") != 0;
     size_t count = 0;
     double seconds = 0.0;
@@ -1013,23 +1034,29 @@ static gsf_result render_all(gsfix_app* app, const float* background) { // NULL:
     }
     if (result == GSF_OK && filtered) result = open_filter(app, &scene, &splats, &desc, &filter);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
+    if (result == GSF_OK)
+        result = app->o.path ? begin_render_video(app, path, sizeof *path, count, &video)
+                             : begin_render_video(app, &scene.views[0].camera, sizeof scene.views[0], count, &video);
     gsfix_json_begin(ctx, &app->json, "frames", '[');
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
         const gsfix_path name = frame_name(app->o.path ? NULL : &scene, i);
         const gsf_camera* camera = app->o.path ? path + i : &scene.views[i].camera;
         const double begin = gsfix_now();
         result = gsf_is_cancelled(ctx) ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped after %zu of %zu frames", i, count)
-                                       : render_one(app, rasterizer, &splats, camera, &desc, name.s);
-        if (result == GSF_OK && filtered) result = filter_one(app, &filter, camera, name.s);
+                                       : render_one(app, rasterizer, &splats, camera, &desc, name.s, filtered ? NULL : video);
+        if (result == GSF_OK && filtered) result = filter_one(app, &filter, camera, name.s, video);
         seconds += gsfix_now() - begin;
         gsfix_json_text(ctx, &app->json, NULL, gsfix_pathf("%s.png", name.s).s);
         gsfix_progress(app, (double)(i + 1), (double)count, "frame %zu of %zu", i + 1, count);
     }
     gsfix_json_end(ctx, &app->json, ']');
     gsfix_json_number(ctx, &app->json, "seconds", seconds);
+    if (result == GSF_OK) result = gsfix_finish_video(video);
+    gsfix_destroy_video(video);
+    if (result == GSF_OK && app->o.video) gsfix_json_text(ctx, &app->json, "video", app->o.video);
     if (result == GSF_OK)
-        gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s", count, splats.count, seconds,
-                    app->o.out);
+        gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s%s%s", count, splats.count, seconds,
+                    app->o.out, app->o.video ? ", " : "", app->o.video ? app->o.video : "");
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
     close_filter(app, &filter);
     gsf_free(ctx, path);
@@ -1049,7 +1076,8 @@ static int run_render(gsfix_app* app) {
         return gsfix_misused(app, "--depth-as %s: one of exr and png16", app->o.depth_as);
     if (app->o.depth_as && !app->o.depth) return gsfix_misused(app, "--depth-as: only with --depth");
     float background[3];
-    const int code = gsfix_splats_background(app, background);
+    int code = gsfix_splats_background(app, background);
+    if (code == 0) code = gsfix_check_video(app);
     if (code) return code;
     return render_all(app, app->o.background ? background : NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }
@@ -1741,7 +1769,17 @@ static gsf_result open_restore_out(gsfix_app* app, const gsfix_clip* c) {
     }
     if (result == GSF_OK) result = gsfix_open_out(app);
     if (result == GSF_OK) result = gsfix_claim_file(app, app->o.save_features);
+    if (result == GSF_OK) result = gsfix_claim_file(app, app->o.video);
     return result == GSF_OK ? gsfix_remove_stale(app) : result;
+}
+
+static gsf_result save_clip_video(gsfix_app* app, const gsf_image* frames, size_t count) {
+    gsfix_video* video = NULL;
+    gsf_result result = gsfix_begin_video(app, frames[0].width, frames[0].height, count, &video);
+    for (size_t i = 0; i < count && result == GSF_OK; i++) result = gsfix_add_frame(video, frames + i);
+    if (result == GSF_OK) result = gsfix_finish_video(video);
+    gsfix_destroy_video(video);
+    return result;
 }
 
 static gsf_result restore_folder(gsfix_app* app) {
@@ -1763,12 +1801,14 @@ static gsf_result restore_folder(gsfix_app* app) {
         if (result == GSF_OK && present)
             result = gsf_save_image(ctx, gsfix_pathf("%s/confidence/%s.png", app->o.out, name.s).s, c.out_confidence + i);
     }
+    if (result == GSF_OK) result = save_clip_video(app, present ? c.out_color : c.color, c.frames);
     if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     if (result == GSF_OK) {
         gsfix_json_text(ctx, &app->json, "restorer", app->o.restorer);
         gsfix_json_number(ctx, &app->json, "frames", (double)c.frames);
         gsfix_json_number(ctx, &app->json, "references", (double)c.refs);
         gsfix_json_number(ctx, &app->json, "seconds", gsfix_now() - begin);
+        if (app->o.video) gsfix_json_text(ctx, &app->json, "video", app->o.video);
         gsfix_json_stages(app, &app->json);
         gsfix_print(app, "%zu frames restored by %s from %zu photos in %.2f s -> %s", c.frames, app->o.restorer, c.refs,
                     gsfix_now() - begin, app->o.out);
@@ -1781,7 +1821,8 @@ static gsf_result restore_folder(gsfix_app* app) {
 
 static int run_restore(gsfix_app* app) {
     if (!app->o.restorer) return gsfix_misused(app, "--restorer is missing");
-    const int code = gsfix_check_restorer(app);
+    int code = gsfix_check_restorer(app);
+    if (code == 0) code = gsfix_check_video(app);
     if (code) return code;
     return restore_folder(app) == GSF_OK ? 0 : gsfix_failed(app);
 }
@@ -1910,9 +1951,11 @@ int main(int argc, char** argv) {
 #include "gsfix_fix.c"
 #include "gsfix_gallery.c"
 #include "gsfix_out.c"
+#include "gsfix_process.c"
 #include "gsfix_report.c"
 #include "gsfix_tables.c"
 #include "gsfix_tasks.c"
 #include "gsfix_util.c"
+#include "gsfix_video.c"
 #include "gsfix_view.c"
 #endif

@@ -18,10 +18,10 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features, *lora;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
-    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot;
+    const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot, *video;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
-    int clean_iterations, seeds, spz_version;
+    int clean_iterations, seeds, spz_version, fps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache, orbit;
     uint64_t seed;
     const char** inputs;
@@ -146,6 +146,41 @@ gsf_result gsfix_make_job(gsfix_app* app, const char** path);
 gsf_result gsfix_empty_job(gsfix_app* app, const char* name); // creates or empties a subfolder
 gsf_result gsfix_check_job(gsfix_app* app, const char* name); // fails if the subfolder has been replaced by something else
 void gsfix_leave_job(gsfix_app* app, int remove);
+
+// A file for another program to write, OUT/.gsfix/draft: it is published as a file that gsfix writes, or else removed.
+gsf_result gsfix_begin_draft(gsfix_app* app, gsfix_path* path);
+gsf_result gsfix_publish_draft(gsfix_app* app, const char* path);
+void gsfix_drop_draft(gsfix_app* app);
+
+// ---- gsfix_process.c -----------------------------------------------------------
+
+typedef struct gsfix_process { // another program; zeroed except for name and code
+    const char* name;  // how messages begin
+    gsf_result code;   // of failures
+    char said[200];    // the first line of what it says, if its streams are pipes
+    size_t said_size;
+    int said_all;
+    intptr_t group, life, child, input, errors; // 0: none
+} gsfix_process;
+
+int gsfix_find_program(const char* name, gsfix_path* out); // in PATH; 0: not found
+// arguments: the program's path and arguments, then NULL; on Windows joined by blanks, to be quoted by the caller. `piped`: it
+// reads what it is fed, and what it says is kept for messages; otherwise it shares gsfix's input and standard error.
+gsf_result gsfix_start_process(gsf_context* ctx, gsfix_process* p, const char* const* arguments, int piped);
+// timeout: seconds in which it takes nothing.
+gsf_result gsfix_feed_process(gsf_context* ctx, gsfix_process* p, const void* data, size_t size, double timeout);
+gsf_result gsfix_wait_process(gsf_context* ctx, gsfix_process* p, double timeout); // ends its input; fails on a status but 0
+void gsfix_end_process(gsfix_process* p); // at once, with all that it has started; may be called again
+
+// ---- gsfix_video.c ---------------------------------------------------------------
+
+typedef struct gsfix_video gsfix_video;
+int gsfix_check_video(gsfix_app* app); // --video and --fps; 0 or an exit code after a message
+// The functions do nothing without --video. Frames that are smaller than width x height are centred. Destroy after errors, too.
+gsf_result gsfix_begin_video(gsfix_app* app, int64_t width, int64_t height, size_t frames, gsfix_video** out);
+gsf_result gsfix_add_frame(gsfix_video* video, const gsf_image* frame);
+gsf_result gsfix_finish_video(gsfix_video* video); // writes the file
+void gsfix_destroy_video(gsfix_video* video);
 
 // ---- gsfix_exec.c --------------------------------------------------------------
 

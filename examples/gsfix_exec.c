@@ -2,22 +2,6 @@
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
-#ifdef _WIN32
-#define WIN32_LEAN_AND_MEAN
-#define NOMINMAX
-#include <windows.h>
-#else
-#include <errno.h>
-#include <fcntl.h>
-#include <signal.h>
-#include <sys/wait.h>
-#include <time.h>
-#include <unistd.h>
-#ifdef __linux__
-#include <sys/prctl.h>
-#endif
-#endif
-
 /* Contents of JOBDIR before the call:
        frames/%05d.png    rendered frames
        depth/%05d.npy     float32 (height,width) camera depth, 0 = nothing there
@@ -30,20 +14,17 @@
        confidence/%05d.png  optional, for all frames or for none: white = full weight (none: full weight everywhere)
    COMMAND is run by the shell; its standard output is redirected to stderr.
    JOBDIR is new in each round and removed afterwards with all its contents, except after a failure.
-   COMMAND, its child processes and a watcher form one process group. The watcher blocks on a pipe whose write end only
-   gsfix holds: when gsfix terminates for any reason, even kill -9, the watcher reads end of file and kills the group.
-   On Windows the shell is cmd.exe, and a job object, which ends with its last handle, takes the place of group and watcher. */
+   On Windows the shell is cmd.exe. */
 typedef struct exec_state {
     gsfix_app* app;
-    char* command;
+    char* name; // "exec: COMMAND"
     const char* job;
     double timeout;
     int failed;
-#ifndef _WIN32
-    pid_t group; // process group, and process ID of the watcher; 0: none
-    int life;    // write end of the pipe
-#endif
+    gsfix_process process;
 } exec_state;
+
+enum { EXEC_PREFIX = sizeof "exec: " - 1 };
 
 static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                              gsf_restorer_info* out) {
@@ -115,189 +96,33 @@ static gsf_result write_job(gsf_context* ctx, exec_state* e, const gsf_restore_w
 }
 
 #ifdef _WIN32
-
-// The command line for cmd.exe, which removes the outer quotes only (/s) and runs no start-up script (/d).
-static wchar_t* command_line(gsf_context* ctx, const exec_state* e) {
+// cmd.exe removes the outer quotes only (/s) and runs no start-up script (/d).
+static gsf_result start_program(gsf_context* ctx, exec_state* e) {
     gsf_buffer line = {0};
     gsfix_path job = gsfix_pathf("%s", e->job); // the shell's own commands take slashes for options
     for (char* c = job.s; *c; c++)
         if (*c == '/') *c = '\\';
-    gsf_append_text(ctx, &line, "cmd.exe /d /s /c \"%s \"%s\"\"", e->command, job.s);
-    const int size = line.failed ? 0 : MultiByteToWideChar(CP_UTF8, 0, line.data, -1, NULL, 0);
-    wchar_t* wide = size > 0 ? (wchar_t*)gsf_alloc(ctx, (size_t)size, sizeof *wide) : NULL;
-    if (wide) MultiByteToWideChar(CP_UTF8, 0, line.data, -1, wide, size);
+    gsf_append_text(ctx, &line, "cmd.exe /d /s /c \"%s \"%s\"\"", e->name + EXEC_PREFIX, job.s);
+    const char* const arguments[] = {line.data, NULL};
+    const gsf_result result = line.failed ? GSF_ERROR_OUT_OF_MEMORY : gsfix_start_process(ctx, &e->process, arguments, 0);
     gsf_destroy_buffer(ctx, &line);
-    return wide;
-}
-
-static HANDLE make_job(void) { // all its processes end when the last handle is closed, at the latest when this process ends
-    JOBOBJECT_EXTENDED_LIMIT_INFORMATION limits;
-    HANDLE job = CreateJobObjectW(NULL, NULL);
-    memset(&limits, 0, sizeof limits);
-    limits.BasicLimitInformation.LimitFlags = JOB_OBJECT_LIMIT_KILL_ON_JOB_CLOSE;
-    if (job) SetInformationJobObject(job, JobObjectExtendedLimitInformation, &limits, sizeof limits);
-    return job;
-}
-
-static int start_program(wchar_t* line, HANDLE job, PROCESS_INFORMATION* process) {
-    STARTUPINFOW start;
-    memset(&start, 0, sizeof start);
-    start.cb = sizeof start;
-    start.dwFlags = STARTF_USESTDHANDLES;
-    start.hStdInput = GetStdHandle(STD_INPUT_HANDLE);
-    start.hStdOutput = GetStdHandle(STD_ERROR_HANDLE); // stdout is reserved for --json
-    start.hStdError = GetStdHandle(STD_ERROR_HANDLE);
-    if (!CreateProcessW(NULL, line, NULL, NULL, TRUE, CREATE_SUSPENDED, NULL, NULL, &start, process)) return 0;
-    AssignProcessToJobObject(job, process->hProcess); // before it can start others
-    ResumeThread(process->hThread);
-    return 1;
-}
-
-static gsf_result run_program(gsf_context* ctx, exec_state* e) {
-    PROCESS_INFORMATION process;
-    wchar_t* line = command_line(ctx, e);
-    if (!line) return GSF_ERROR_OUT_OF_MEMORY;
-    fflush(NULL);
-    HANDLE job = make_job();
-    const int started = job && start_program(line, job, &process);
-    const DWORD reason = GetLastError();
-    gsf_free(ctx, line);
-    if (!started) {
-        if (job) CloseHandle(job);
-        return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: error %lu", (unsigned long)reason);
-    }
-    const double begin = gsfix_now();
-    gsf_result result = GSF_OK;
-    while (WaitForSingleObject(process.hProcess, 20) == WAIT_TIMEOUT && result == GSF_OK) {
-        if (gsf_is_cancelled(ctx)) result = gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled");
-        else if (gsfix_now() - begin > e->timeout)
-            result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped", e->command,
-                              e->timeout);
-    }
-    DWORD status = 1;
-    if (result == GSF_OK && GetExitCodeProcess(process.hProcess, &status) && status != 0)
-        result = gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s %s ended with status %lu", e->command, e->job,
-                          (unsigned long)status);
-    if (result != GSF_OK) TerminateJobObject(job, 1);
-    CloseHandle(process.hThread);
-    CloseHandle(process.hProcess);
-    CloseHandle(job);
     return result;
 }
-
-static void end_group(exec_state* e) { (void)e; }
-
 #else
-
-static void watch(int life) { // runs in its own process; only async-signal-safe calls after the fork
-    static const int ignored[] = {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE};
-    const long most = sysconf(_SC_OPEN_MAX);
-    char byte;
-    ssize_t n;
-    for (size_t i = 0; i < sizeof ignored / sizeof *ignored; i++) signal(ignored[i], SIG_IGN);
-    for (int fd = 0; fd < (most > 0 && most < 65536 ? most : 65536); fd++)
-        if (fd != life) close(fd); // most importantly the lock on OUT
-    while ((n = read(life, &byte, 1)) < 0 && errno == EINTR) {}
-    kill(0, SIGKILL);
-    _exit(0);
+static gsf_result start_program(gsf_context* ctx, exec_state* e) {
+    gsf_buffer script = {0};
+    gsf_append_text(ctx, &script, "%s \"$@\"", e->name + EXEC_PREFIX);
+    const char* const arguments[] = {"/bin/sh", "-c", script.data, "sh", e->job, NULL};
+    const gsf_result result = script.failed ? GSF_ERROR_OUT_OF_MEMORY : gsfix_start_process(ctx, &e->process, arguments, 0);
+    gsf_destroy_buffer(ctx, &script);
+    return result;
 }
-
-static gsf_result start_watcher(gsf_context* ctx, exec_state* e) {
-    int ends[2];
-    if (e->group) return GSF_OK;
-    if (pipe(ends) != 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no pipe: %s", strerror(errno));
-    fcntl(ends[0], F_SETFD, FD_CLOEXEC);
-    fcntl(ends[1], F_SETFD, FD_CLOEXEC);
-    const pid_t watcher = fork();
-    if (watcher == 0) {
-        setpgid(0, 0);
-        watch(ends[0]);
-    }
-    close(ends[0]);
-    if (watcher < 0) {
-        close(ends[1]);
-        return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
-    }
-    setpgid(watcher, watcher); // in parent and child, to avoid a race
-    e->group = watcher;
-    e->life = ends[1];
-    return GSF_OK;
-}
-
-static void end_group(exec_state* e) {
-    if (!e->group) return;
-    kill(-e->group, SIGKILL);
-    while (waitpid(e->group, NULL, 0) < 0 && errno == EINTR) {}
-    close(e->life);
-    e->group = 0;
-}
-
-static void stop_program(exec_state* e, pid_t child) { // grants it a second to exit
-    kill(-e->group, SIGTERM);
-    for (int i = 0; i < 50; i++) {
-        const struct timespec pause = {0, 20000000};
-        if (waitpid(child, NULL, WNOHANG) == child) {
-            end_group(e);
-            return;
-        }
-        nanosleep(&pause, NULL);
-    }
-    kill(-e->group, SIGKILL);
-    waitpid(child, NULL, 0);
-    end_group(e);
-}
-
-static void become_program(const exec_state* e, const char* script, pid_t parent) { // in the child
-    setpgid(0, e->group); // so that its children can be stopped with it
-#ifdef __linux__
-    prctl(PR_SET_PDEATHSIG, SIGKILL);
 #endif
-    if (getppid() != parent) _exit(127); // the parent has terminated meanwhile
-    signal(SIGINT, SIG_DFL);
-    signal(SIGTERM, SIG_DFL);
-    signal(SIGXFSZ, SIG_DFL);
-    dup2(2, 1); // stdout is reserved for --json
-    execl("/bin/sh", "sh", "-c", script, "sh", e->job, (char*)NULL);
-    _exit(127);
-}
 
 static gsf_result run_program(gsf_context* ctx, exec_state* e) {
-    gsf_buffer script = {0};
-    gsf_append_text(ctx, &script, "%s \"$@\"", e->command);
-    if (script.failed) return GSF_ERROR_OUT_OF_MEMORY;
-    const gsf_result watched = start_watcher(ctx, e);
-    fflush(NULL);
-    const pid_t parent = getpid(), child = watched == GSF_OK ? fork() : -1;
-    if (child == 0) become_program(e, script.data, parent);
-    gsf_destroy_buffer(ctx, &script);
-    if (watched != GSF_OK) return watched;
-    if (child < 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
-    setpgid(child, e->group); // in parent and child, to avoid a race
-    const double begin = gsfix_now();
-    for (;;) {
-        int status = 0;
-        const pid_t ended = waitpid(child, &status, WNOHANG);
-        if (ended < 0 && errno != EINTR) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: waitpid: %s", strerror(errno));
-        if (ended == child) {
-            if (WIFEXITED(status) && WEXITSTATUS(status) == 0) return GSF_OK;
-            if (WIFSIGNALED(status))
-                return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s was ended by signal %d", e->command, WTERMSIG(status));
-            return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s %s ended with status %d", e->command, e->job,
-                            WEXITSTATUS(status));
-        }
-        const int cancelled = gsf_is_cancelled(ctx);
-        if (cancelled || gsfix_now() - begin > e->timeout) {
-            stop_program(e, child);
-            return cancelled ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled")
-                             : gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped",
-                                        e->command, e->timeout);
-        }
-        const struct timespec pause = {0, 10000000};
-        nanosleep(&pause, NULL);
-    }
+    const gsf_result result = start_program(ctx, e);
+    return result == GSF_OK ? gsfix_wait_process(ctx, &e->process, e->timeout) : result;
 }
-
-#endif
 
 static gsf_result read_result(gsf_context* ctx, const char* path, int32_t channels, const gsf_image* out) {
     gsf_image image;
@@ -350,8 +175,8 @@ static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_w
 
 static void exec_destroy(void* user, gsf_context* ctx) {
     exec_state* e = (exec_state*)user;
-    end_group(e);
-    gsf_free(ctx, e->command);
+    gsfix_end_process(&e->process);
+    gsf_free(ctx, e->name);
     gsf_free(ctx, e);
 }
 
@@ -361,7 +186,10 @@ gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, 
     exec_state* e = (exec_state*)gsf_alloc_zeroed(ctx, 1, sizeof *e);
     if (!e) return GSF_ERROR_OUT_OF_MEMORY;
     e->app = app;
-    e->command = gsfix_copy_text(ctx, command, strlen(command));
+    const gsfix_path name = gsfix_pathf("exec: %s", command);
+    e->name = gsfix_copy_text(ctx, name.s, strlen(name.s));
+    e->process.name = e->name;
+    e->process.code = GSF_ERROR_RESTORER;
     e->timeout = timeout;
     out->struct_size = sizeof *out;
     out->name = "exec";
@@ -371,7 +199,7 @@ gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, 
     out->restore_fn = exec_restore;
     out->end_fn = exec_end;
     out->destroy_fn = exec_destroy;
-    if (e->command) return GSF_OK;
+    if (e->name) return GSF_OK;
     gsf_destroy_restorer(ctx, out);
     return GSF_ERROR_OUT_OF_MEMORY;
 }

@@ -851,7 +851,8 @@ static gsf_result open_fix_out(fix_run* run) {
         result = gsfix_claim(app, "%s", repair[i]);
     if (result == GSF_OK && run->task) result = run->task->claim_fn(app, run->task->user);
     if (result == GSF_OK) result = gsfix_open_out(app);
-    return result == GSF_OK ? gsfix_claim_file(app, app->o.save_features) : result;
+    if (result == GSF_OK) result = gsfix_claim_file(app, app->o.save_features);
+    return result == GSF_OK ? gsfix_claim_file(app, app->o.video) : result;
 }
 
 static gsf_result load_photos(fix_run* run) {
@@ -1231,6 +1232,38 @@ static gsf_result save_splats(fix_run* run, const gsf_splats* splats) {
     return result;
 }
 
+// The repaired frames, from their files: those of an interrupted run are among them. Their sizes are looked at first.
+static gsf_result save_fixed_video(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    const gsfix_history* h = &run->history;
+    gsfix_video* video = NULL;
+    int64_t width = 0, height = 0;
+    size_t count = 0;
+    gsf_result result = GSF_OK;
+    for (int pass = 0; pass < 2 && result == GSF_OK; pass++) {
+        int32_t frame = 0;
+        if (pass) result = gsfix_begin_video(run->app, width, height, count, &video);
+        for (size_t i = 0; i < h->path_count && result == GSF_OK; i++) {
+            const gsfix_flown* flown = &h->path[i];
+            gsf_image image = {0};
+            frame = i && flown[-1].round == flown->round && flown[-1].window == flown->window ? frame + 1 : 0;
+            const gsfix_path name = gsfix_pathf("fixed/round%d_window%d_%05d.png", (int)flown->round, (int)flown->window,
+                                                (int)frame);
+            if (!gsfix_has_output(run->app, name.s)) continue; // of a window that was left as it is
+            result = gsf_load_image(ctx, gsfix_pathf("%s/%s", run->app->o.out, name.s).s, 3, &image);
+            if (image.width > width) width = image.width;
+            if (image.height > height) height = image.height;
+            if (result == GSF_OK && pass) result = gsfix_add_frame(video, &image);
+            if (result == GSF_OK && gsf_is_cancelled(ctx)) result = gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled");
+            count++;
+            gsf_destroy_image(ctx, &image);
+        }
+    }
+    if (result == GSF_OK) result = gsfix_finish_video(video);
+    gsfix_destroy_video(video);
+    return result;
+}
+
 static gsf_result finish(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsfix_history* h = &run->history;
@@ -1269,6 +1302,7 @@ static gsf_result finish(fix_run* run) {
         write_metrics(run, &r);
         result = save_metrics(run);
         if (result == GSF_OK) result = gsfix_write_report(run->app, &r);
+        if (result == GSF_OK && run->app->o.video) result = save_fixed_video(run);
         if (result == GSF_OK) print_results(run, &r);
     }
     gsf_free(ctx, views);
@@ -1317,7 +1351,10 @@ gsf_result gsfix_fix_scene(gsfix_app* app, const gsfix_setup* setup, const gsfix
 
 int gsfix_run_fix(gsfix_app* app) {
     gsfix_setup setup;
-    const int code = gsfix_resolve_setup(app, &setup);
+    int code = gsfix_resolve_setup(app, &setup);
+    if (code == 0) code = gsfix_check_video(app);
     if (code) return code;
+    if (app->o.video && (!app->o.restorer || strcmp(app->o.restorer, "none") == 0))
+        return gsfix_misused(app, "--video: shows what a --restorer repairs, and there is none (see gsfix render --video)");
     return gsfix_fix_scene(app, &setup, NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }

@@ -25,6 +25,7 @@
        OUT/.gsfix/manifest   "gsfix manifest 1", then a line per file: XXH64 of its bytes, size, command, name
        OUT/.gsfix/lock       locked by the run that is at work in OUT, as long as its process lives
        OUT/.gsfix/new        the file that is being written; renamed once it is whole
+       OUT/.gsfix/draft      the file that another program is writing for gsfix
    A file is ours as long as the manifest lists its name with its size and digest; once edited or replaced it is the user's.
    The line is written before the file is renamed into place, so that after a kill at any moment both the old and the new
    file are known. A truncated last line is ignored. Names are relative, so a copy of OUT takes its manifest along. Each run
@@ -496,6 +497,7 @@ static gsf_result renew_manifest(gsfix_app* app) {
     }
     for (size_t i = 0; i < o->line_count; i++) print_line(ctx, &text, o->lines + i);
     unlinkat(o->own, "new", 0);
+    unlinkat(o->own, "draft", 0);
     gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
     if (result == GSF_OK && (!write_new(o->own, "new", text.data, text.size, 1) ||
                              renameat(o->own, "new", o->own, "manifest") != 0 ||
@@ -666,7 +668,7 @@ static gsf_result check_own(gsfix_app* app) {
     gsf_result result = GSF_OK;
     for (struct dirent* entry; list && result == GSF_OK && (entry = readdir(list)) != NULL;)
         if (strcmp(entry->d_name, ".") && strcmp(entry->d_name, "..") && strcmp(entry->d_name, "lock") &&
-            strcmp(entry->d_name, "new"))
+            strcmp(entry->d_name, "new") && strcmp(entry->d_name, "draft"))
             result = gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/.gsfix/%s: not written by gsfix (choose another --out)", app->o.out,
                               entry->d_name);
     if (list) closedir(list);
@@ -885,8 +887,14 @@ gsf_result gsfix_claim_file(gsfix_app* app, const char* path) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
     struct stat s;
-    const char* base;
+    const char *base, *inner = path && o->root >= 0 ? below(path, app->o.out) : NULL;
     if (!path) return GSF_OK;
+    if (inner && is_claimed(o, inner, 0))
+        return gsf_fail(ctx, GSF_ERROR_IO, "%s: the command writes another file of this name", path);
+    if (inner) {
+        const gsf_result result = gsfix_claim(app, "%s", inner);
+        return result == GSF_OK ? check_claim(app, inner) : result;
+    }
     const gsfix_path name = gsfix_absolute(path);
     const int folder = name.s[0] ? folder_of(o, name.s, &base) : -1;
     gsf_result result = GSF_OK;
@@ -905,6 +913,32 @@ gsf_result gsfix_claim_file(gsfix_app* app, const char* path) {
     }
     return result;
 }
+
+// ---- drafts ----------------------------------------------------------------------
+
+gsf_result gsfix_begin_draft(gsfix_app* app, gsfix_path* path) {
+    char* real = realpath(app->o.out, NULL);
+    if (!real) return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s: %s", app->o.out, strerror(errno));
+    *path = gsfix_pathf("%s/.gsfix/draft", real);
+    free(real);
+    gsfix_drop_draft(app);
+    return GSF_OK;
+}
+
+gsf_result gsfix_publish_draft(gsfix_app* app, const char* path) {
+    gsf_context* ctx = &app->ctx;
+    gsfix_out* o = app->out;
+    void* data = NULL;
+    size_t size = 0;
+    gsf_result result = o->plain.read_fn(o->plain.user, ctx, gsfix_pathf("%s/.gsfix/draft", app->o.out).s, &data, &size);
+    if (result == GSF_OK && !size) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: is empty", path);
+    if (result == GSF_OK) result = gsf_write_file(ctx, path, data, size);
+    gsf_free(ctx, data);
+    gsfix_drop_draft(app);
+    return result;
+}
+
+void gsfix_drop_draft(gsfix_app* app) { unlinkat(app->out->own, "draft", 0); }
 
 // ---- job folders -----------------------------------------------------------------
 

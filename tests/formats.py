@@ -1,14 +1,22 @@
-"""Splats written by gsfix as .glb, read by pygltflib, beside the PLY that they were made from, read by plyfile; and the other
-way round. Colors are compared as the extension's text defines them, in glTF's axes. See formats.sh.
+"""What gsfix writes, read by others; and what they write, read by gsfix. See formats.sh.
+  .glb               by pygltflib, beside the PLY that it was made from, read by plyfile; colors as the extension's text defines
+                     them, in glTF's axes
+  .spz, 3 and 4      by gsply (zstandard for 4)
+  COLMAP models      by pycolmap: cameras as text, filtered points
+  transforms.json    by a reader made here from nerfstudio's documentation (docs.nerf.studio, "Data conventions"): nerfstudio's
+                     own needs PyTorch
 
-    formats.py GSFIX"""
+    formats.py GSFIX SCENE      SCENE: made by make_scene"""
+import json
 import os
 import subprocess
 import sys
 import tempfile
 
+import gsply
 import numpy as np
 import plyfile
+import pycolmap
 import pygltflib
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
@@ -121,7 +129,129 @@ def write_theirs(gsfix, folder):
     check("by pygltflib: colors", np.abs(columns(ply, "f_dc_", 3) - arrays[NAME + ":SH_DEGREE_0_COEF_0"]).max(), 0.0)
 
 
+SPZ_AXES = np.array([1.0, -1.0, -1.0]) # SPZ's, of ours
+
+
+def spz_signs():
+    """Of the SH coefficients above band 0, from our axes to SPZ's."""
+    d = np.array([0.3, 0.5, np.sqrt(0.66)])
+    return np.rint(harmonics(d * SPZ_AXES) / harmonics(d))[1:]
+
+
+def unit(quaternions):
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def same_turns(what, a, b, bar):
+    check(what, np.minimum(np.abs(unit(a) - unit(b)).max(1), np.abs(unit(a) + unit(b)).max(1)).max(), bar)
+
+
+def read_spz(gsfix, folder, version):
+    """Ours, read by gsply: off by at most half a step of each number, or clamped to its range."""
+    path, name = os.path.join(folder, "ours_%d.spz" % version), "spz %d: " % version
+    subprocess.run([gsfix, "convert", PLY, "--out", path, "--spz-version", str(version)], check=True, stdout=subprocess.DEVNULL)
+    ply, theirs = plyfile.PlyData.read(PLY)["vertex"], gsply.read_spz(path)
+    check(name + "positions", np.abs(theirs.means * SPZ_AXES - positions(ply)).max(), 0.51 / 4096)
+    check(name + "log-scales", np.abs(theirs.scales - columns(ply, "scale_", 3)).max(), 0.51 / 16)
+    check(name + "opacities", np.abs(sigmoid(theirs.opacities.ravel()) - sigmoid(ply["opacity"])).max(), 0.51 / 255)
+    same_turns(name + "rotations", theirs.quats * np.append(1.0, SPZ_AXES), columns(ply, "rot_", 4), 2.6e-3)
+    most = 0.5 / 0.15
+    check(name + "colors", np.abs(theirs.sh0.reshape(-1, 3) - np.clip(columns(ply, "f_dc_", 3), -most, most)).max(),
+          0.51 / (0.15 * 255))
+    rest = np.clip(columns(ply, "f_rest_", 45).reshape(-1, 3, 15).transpose(0, 2, 1), -1.0, 127 / 128)
+    off = np.abs(theirs.shN * spz_signs()[None, :, None] - rest)
+    check(name + "SH, band 1", off[:, :3].max(), 4.51 / 128) # 5 bits, then 4, of a number that was rounded to 8 before
+    check(name + "SH, bands 2 and 3", off[:, 3:].max(), 8.51 / 128)
+    return theirs
+
+
+def write_spz(gsfix, folder, theirs, version):
+    """gsply's, read by gsfix: the values that gsply reads itself."""
+    path, out = os.path.join(folder, "theirs_%d.spz" % version), os.path.join(folder, "theirs_%d.ply" % version)
+    name = "by gsply, %d: " % version
+    gsply.write_spz(path, theirs, version=version)
+    again = gsply.read_spz(path)
+    subprocess.run([gsfix, "convert", path, "--out", out], check=True, stdout=subprocess.DEVNULL)
+    ply = plyfile.PlyData.read(out)["vertex"]
+    check(name + "positions", np.abs(again.means * SPZ_AXES - positions(ply)).max(), 1e-6)
+    check(name + "log-scales", np.abs(again.scales - columns(ply, "scale_", 3)).max(), 1e-6)
+    check(name + "opacities", np.abs(sigmoid(again.opacities.ravel()) - sigmoid(ply["opacity"])).max(), 1e-6)
+    same_turns(name + "rotations", again.quats * np.append(1.0, SPZ_AXES), columns(ply, "rot_", 4), 1e-6)
+    check(name + "colors", np.abs(again.sh0.reshape(-1, 3) - columns(ply, "f_dc_", 3)).max(), 1e-6)
+    rest = columns(ply, "f_rest_", 45).reshape(-1, 3, 15).transpose(0, 2, 1)
+    check(name + "SH", np.abs(again.shN * spz_signs()[None, :, None] - rest).max(), 1e-6)
+
+
+def from_nerfstudio(frame, points):
+    """Pixels of points in the world: transform_matrix is camera to world; the camera looks along -z, y is up."""
+    c2w = np.array(frame["transform_matrix"])
+    assert c2w.shape == (4, 4) and (c2w[3] == [0, 0, 0, 1]).all() and np.abs(np.linalg.det(c2w[:3, :3]) - 1) < 1e-9
+    right, up, back = ((points - c2w[:3, 3]) @ c2w[:3, :3]).T
+    return np.stack([frame["fl_x"] * right / -back + frame["cx"], -frame["fl_y"] * up / -back + frame["cy"]], 1)
+
+
+def read_cameras(gsfix, folder, scene):
+    """A path as our JSON, as transforms.json and as COLMAP's text: where points of the scene fall in the pictures."""
+    colmap = os.path.join(folder, "colmap")
+    os.mkdir(colmap)
+    files = [os.path.join(folder, "path.json"), os.path.join(folder, "transforms.json"), os.path.join(colmap, "images.txt")]
+    for file in files:
+        subprocess.run([gsfix, "path", scene, "--views", "3", "--max-size", "91", "--frames", "12", "--out", file], check=True,
+                       stdout=subprocess.DEVNULL)
+    with open(files[0], encoding="utf-8") as file:
+        ours = json.load(file)["cameras"]
+    with open(files[1], encoding="utf-8") as file:
+        nerfstudio = json.load(file)
+    model = pycolmap.Reconstruction()
+    model.read_text(colmap)
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    assert len(ours) == len(images) == len(nerfstudio["frames"]) == 12 and nerfstudio["camera_model"] == "PINHOLE"
+    rng, worst = np.random.default_rng(3), [0.0, 0.0]
+    for camera, frame, image in zip(ours, nerfstudio["frames"], images):
+        assert os.path.basename(frame["file_path"]) == image.name
+        assert [frame["w"], frame["h"]] == [camera["width"], camera["height"]] == [image.camera.width, image.camera.height]
+        w2c = np.array(camera["w2c"]).reshape(4, 4) # x is right, y down, z forward
+        seen = np.column_stack([rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100)]) * rng.uniform(1, 5, (100, 1))
+        points = (seen - w2c[:3, 3]) @ w2c[:3, :3]
+        pixels = seen[:, :2] / seen[:, 2:] * [camera["fx"], camera["fy"]] + [camera["cx"], camera["cy"]]
+        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        at = points @ pose.rotation.matrix().T + pose.translation
+        worst[0] = max(worst[0], np.abs(from_nerfstudio(frame, points) - pixels).max())
+        worst[1] = max(worst[1], np.abs(image.camera.img_from_cam(at) - pixels).max())
+    check("transforms.json: pixels", worst[0], 1e-9)
+    check("COLMAP text, by pycolmap: pixels", worst[1], 1e-9)
+
+
+def read_model(gsfix, folder, scene):
+    """A filtered model by pycolmap, beside the whole one; the whole one as pycolmap's text, by gsfix."""
+    out, text = os.path.join(folder, "filtered"), os.path.join(folder, "text")
+    subprocess.run([gsfix, "filter", scene, "--views", "3", "--method", "tracks", "--out", out], check=True,
+                   stdout=subprocess.DEVNULL)
+    whole = pycolmap.Reconstruction(os.path.join(scene, "sparse", "0"))
+    part = pycolmap.Reconstruction(os.path.join(out, "sparse", "0"))
+    assert 0 < len(part.points3D) < len(whole.points3D)
+    for i, point in part.points3D.items():
+        assert (point.xyz == whole.points3D[i].xyz).all() and (point.color == whole.points3D[i].color).all()
+    poses = {image.name: image.cam_from_world().matrix() for image in whole.images.values()}
+    check("filtered model, by pycolmap: poses",
+          max(np.abs(image.cam_from_world().matrix() - poses[image.name]).max() for image in part.images.values()), 1e-15)
+    os.makedirs(os.path.join(text, "sparse", "0"))
+    os.symlink(os.path.join(os.path.abspath(scene), "images"), os.path.join(text, "images"))
+    whole.write_text(os.path.join(text, "sparse", "0"))
+    paths = []
+    for source in (scene, text):
+        paths.append(os.path.join(folder, "path_%d.json" % len(paths)))
+        subprocess.run([gsfix, "path", source, "--views", "3", "--frames", "12", "--out", paths[-1]], check=True,
+                       stdout=subprocess.DEVNULL)
+    both = [np.array([c["w2c"] for c in json.load(open(path, encoding="utf-8"))["cameras"]]) for path in paths]
+    check("model as pycolmap's text, by gsfix: a path", np.abs(both[0] - both[1]).max(), 1e-12)
+
+
 with tempfile.TemporaryDirectory() as scratch:
     read_ours(sys.argv[1], scratch)
     write_theirs(sys.argv[1], scratch)
+    for number in (3, 4):
+        write_spz(sys.argv[1], scratch, read_spz(sys.argv[1], scratch, number), number)
+    read_cameras(sys.argv[1], scratch, sys.argv[2])
+    read_model(sys.argv[1], scratch, sys.argv[2])
 sys.exit(failed)

@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
-"""test_web.py PAGE SCRATCH: uses the page of examples/web in headless Chromium, as a visitor would: makes a scene, trains on three
-photos of it, orbits it with the mouse, drops the splats that it saved, and a file that is none. PSNR rises, the pictures
+"""test_web.py PAGE SCRATCH [GSFIX SCENE]: uses the page of examples/web in headless Chromium, as a visitor would: makes a scene,
+trains on three photos of it, orbits it with the mouse, drops the splats that it saved, and a file that is none; with GSFIX,
+the same splats in the other formats; and SCENE, made by make_scene, as a folder and as files. PSNR rises, the pictures
 change, the console has no errors; with threads, where the page is isolated, and without, to the same PSNR. Pictures of
 the page are left in SCRATCH. Exits with 77 without Chromium. The page is driven through Chromium's DevTools protocol over
 pipes."""
@@ -111,6 +112,15 @@ class Page:
         for kind in ("dragEnter", "dragOver", "drop"):
             self.call("Input.dispatchDragEvent", type=kind, x=300, y=300, data=data)
 
+    def refused(self):  # what the page says about the files dropped last
+        end = time.monotonic() + LIMIT
+        while not self.ask("gsfixer.error") and time.monotonic() < end:
+            time.sleep(0.1)
+        said = self.ask("gsfixer.error")
+        check(said and self.ask("document.getElementById('message').textContent") == said, "bad files are not refused")
+        self.ask("gsfixer.error = ''")
+        return said
+
     def picture(self, path):
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         with open(path, "wb") as file:
@@ -186,6 +196,71 @@ def make_and_train(page, address, scratch, name):
     return page.ask("gsfixer.state"), curve
 
 
+def drop_splats(page, saved, scratch, gsfix):
+    """The page's own splats, in all formats that it reads, and in one that it does not."""
+    plain = os.path.join(scratch, "plain.ply")  # without the colour behind the splats, which no other format keeps
+    with open(saved, "rb") as file, open(plain, "wb") as without:
+        head, rest = file.read().split(b"end_header\n", 1)
+        without.write(b"".join(l for l in head.splitlines(True) if not l.startswith(b"comment")) + b"end_header\n" + rest)
+    files = [saved, plain]
+    for name, version in (("splats.spz", 3), ("splats.glb", 3), ("splats.splat", 3), ("version_4.spz", 4)) if gsfix else ():
+        files.append(os.path.join(scratch, name))
+        made = subprocess.run([gsfix, "convert", saved, "--out", files[-1], "--spz-version", str(version)], capture_output=True,
+                              text=True)
+        if made.returncode and "zstd" in made.stderr:
+            files.pop()  # this gsfix was built without it
+        else:
+            check(made.returncode == 0, made.stderr)
+    opened, first, count = 1, None, page.ask("gsfixer.state.splats")
+    for name in files:
+        before = page.pixels()
+        page.drop([name])
+        if "version_4" in name:
+            said = page.refused()
+            check("SPZ 4 needs" in said and "gsfix convert" in said, "no clear line about SPZ 4: " + said)
+            page.picture(os.path.join(scratch, "version_4.png"))
+            continue
+        opened += 1
+        page.wait("gsfixer.opened === %d" % opened, name + " is not opened")
+        shown = page.settled(before)
+        check(shown["colours"] > 100, name + " shows nothing")
+        check(page.ask("gsfixer.state.splats") == count, name + " has another number of splats")
+        page.picture(os.path.join(scratch, "dropped_%s.png" % os.path.basename(name)))
+        # Beside the PLY: what the formats round, and nothing else.
+        now = page.ask("[...document.getElementById('view').getContext('2d').getImageData(0, 0, %d, %d).data]"
+                       % (shown["width"], shown["height"]))
+        if name == plain:
+            first = now
+        if not first:
+            continue
+        off = sum(abs(a - b) for a, b in zip(first, now)) / len(now)
+        print("%-14s %.2f of 255 from the PLY" % (os.path.basename(name), off))
+        check(len(now) == len(first) and off < 6, name + " looks different")
+    return opened
+
+
+def drop_photos(page, scene, scratch, opened):
+    """Photos with their COLMAP model: as one folder, then file by file."""
+    files = [os.path.join(f, n) for f, _, names in os.walk(scene) for n in sorted(names)]
+    files = [f for f in files if os.path.dirname(os.path.relpath(f, scene)) in ("images", os.path.join("sparse", "0"))]
+    psnr = []
+    for name, dropped in (("folder", [scene]), ("files", files)):
+        page.drop(dropped)
+        opened += 1
+        page.wait("gsfixer.opened === %d" % opened, "photos are not opened as " + name)
+        photos = sum(f.endswith(".png") for f in files)
+        state = page.ask("gsfixer.state")
+        check(state["photos"] == 3 and state["heldOut"] == (photos + 7) // 8, "other photos: %s" % state)
+        page.ask("gsfixer.trainUntil(%d)" % STEPS)
+        page.wait("gsfixer.state.iteration === %d && !gsfixer.training" % STEPS, "the training does not end")
+        curve = page.ask("gsfixer.curve()")
+        check(curve[-1]["psnr"] > curve[0]["psnr"] + 0.5, "PSNR does not rise: %s" % curve)
+        psnr.append(curve[-1]["psnr"])
+        page.picture(os.path.join(scratch, "photos_as_%s.png" % name))
+    check(psnr[0] == psnr[1], "another PSNR from files: %s" % psnr)
+    print("%d photos dropped: %.2f dB after %d steps" % (photos, psnr[0], STEPS))
+
+
 def main():
     folder, scratch = sys.argv[1:3]
     if not any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))):
@@ -229,19 +304,12 @@ def main():
             page.ask("0")
             time.sleep(0.1)
         check(os.path.exists(saved), "nothing is saved")
-        opened = 1
-        for name in [saved] + [os.path.join(scratch, n) for n in sys.argv[3:]]:
-            before = page.pixels()
-            page.drop([name])
-            opened += 1
-            page.wait("gsfixer.opened === %d" % opened, name + " is not opened")
-            check(page.settled(before)["colours"] > 100, name + " shows nothing")
-        page.picture(os.path.join(scratch, "dropped.png"))
+        opened = drop_splats(page, saved, scratch, sys.argv[3] if sys.argv[3:] else None)
+        if sys.argv[4:]:
+            drop_photos(page, sys.argv[4], scratch, opened)
         page.drop([os.path.join(tests, "golden/splat/bad/ply/07_bad_magic.ply")])
-        end = time.monotonic() + LIMIT
-        while not page.ask("gsfixer.error") and time.monotonic() < end:
-            time.sleep(0.1)
-        check("magic" in page.ask("gsfixer.error") or "ply" in page.ask("gsfixer.error"), "a bad file is not refused")
+        said = page.refused()
+        check("magic" in said or "ply" in said, "a bad file is not refused: " + said)
         check(not page.problems, "the console says: %s" % "; ".join(page.problems))
     finally:
         page.close()

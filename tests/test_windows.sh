@@ -51,6 +51,41 @@ ls -d copied/job-* > /dev/null 2>&1 && fail "a job folder is left"
 says "ended with status 3" fix --out failed --iterations 30 --restorer 'exec:fails.cmd'
 says "took longer than 2 s" fix --out hung --iterations 30 --restorer 'exec:hangs.cmd' --restorer-timeout 2
 
+# Videos: a page, and a program in place of ffmpeg, fed through a pipe.
+gsfix path S --views 3 --max-size 48 --frames 5 --out weg.json > log 2>&1 || { fail "path"; tail -n 3 log; }
+render() { gsfix render Straße_1/splats.ply --path weg.json --out filme "$@"; }
+render --video filme/Film.html > log 2>&1 || { fail "a page as video"; tail -n 3 log; }
+[ -s filme/Film.html ] || fail "the page is missing"
+says "needs ffmpeg" render --video filme/Film.mp4
+mkdir "$scratch/bin"
+cat > ffmpeg.c <<'C'
+#include <fcntl.h>
+#include <io.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <windows.h>
+int wmain(int argc, wchar_t** argv) {
+    static char block[4096];
+    const char* how = getenv("FAKE");
+    size_t n;
+    if (how && how[0] == 'h') Sleep(INFINITE);
+    if (how && how[0] == 'f') return fprintf(stderr, "Unknown encoder\r\n"), 3;
+    FILE* out = _wfopen(argv[argc - 1], L"wb");
+    if (!out) return 4;
+    _setmode(0, _O_BINARY);
+    while ((n = fread(block, 1, sizeof block, stdin)) > 0) fwrite(block, 1, n, out);
+    return fclose(out);
+}
+C
+if x86_64-w64-mingw32-gcc -municode ffmpeg.c -o "$scratch/bin/ffmpeg.exe" 2> log; then
+    folder=Z:$(cd "$scratch/bin" && pwd)/ # Wine's name for it
+    export WINEPATH=${folder//\//\\}
+    render --video filme/Film.mp4 > log 2>&1 || { fail "a video by a program"; tail -n 3 log; }
+    [ "$(wc -c < filme/Film.mp4)" = $((5 * 48 * 32 * 3)) ] || fail "the program got $(wc -c < filme/Film.mp4) bytes"
+    (export FAKE=fails; says "Film.webm: ffmpeg ended with status 3: Unknown encoder" render --video Film.webm; [ $failures = 0 ]) || failures=$((failures + 1))
+    [ ! -e Film.webm ] && [ ! -e filme/.gsfix/draft ] || fail "something is left of a failed video"
+fi
+
 # What is not gsfix's stays.
 echo mine > Straße_1/splats.ply
 says "not written by gsfix" fix --out Straße_1 --iterations 30 --restart

@@ -209,7 +209,14 @@ EMSCRIPTEN_KEEPALIVE int web_make_end(void) {
 
 static gsf_result web_open_splats(const web_file* file, int width, int height) {
     double radius = 1.0;
-    gsf_result result = gsf_splat_parse(&w.ctx, file->path, file->data, file->size, &w.splats);
+    gsf_result result;
+#ifndef GSF_USE_ZSTD // Debian has no zstd for WebAssembly
+    const size_t length = strlen(file->path);
+    if (length > 4 && strcmp(file->path + length - 4, ".spz") == 0 && file->size > 4 && memcmp(file->data, "NGSP", 4) == 0)
+        return gsf_fail(&w.ctx, GSF_ERROR_UNSUPPORTED, "%s: SPZ 4 needs zstd, and this page is built without it; "
+                        "gsfix convert FILE.spz --out FILE.glb makes a file that it reads", file->path);
+#endif
+    result = gsf_splat_parse(&w.ctx, file->path, file->data, file->size, &w.splats);
     if (result == GSF_OK && !w.splats.count) result = gsf_fail(&w.ctx, GSF_ERROR_DEGENERATE, "%s: no splats", file->path);
     if (result == GSF_OK) result = orbit_face(&w.ctx, &w.at, &w.splats, width, height, &radius);
     w.desc.near_plane = (float)(0.02 * radius);

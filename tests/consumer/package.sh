@@ -40,7 +40,8 @@ fi
 
 if command -v conan > /dev/null; then
     export CONAN_HOME=$scratch/conan
-    { conan profile detect && conan create "$here/conan" --build=missing; } > "$scratch/log" 2>&1 ||
+    { conan profile detect && conan create "$here/conan" --build=missing --no-remote \
+        -c "tools.cmake.cmake_layout:test_folder=$scratch/test"; } > "$scratch/log" 2>&1 ||
         { tail -n 60 "$scratch/log"; fail "conan create"; }
     echo "conan's recipe: made, and used by a project"
 fi

@@ -17,7 +17,7 @@ class Gsfixer(ConanFile):
     no_copy_source = True
 
     def source(self):
-        unzip(self, os.environ["GSFIXER_TARBALL"], self.source_folder)
+        unzip(self, os.environ["GSFIXER_TARBALL"], self.source_folder, strip_root=True)
 
     def generate(self):
         toolchain = CMakeToolchain(self)
