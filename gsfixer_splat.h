@@ -12130,8 +12130,22 @@ static const char gsf__column_tags[GSF__SAVED_COLUMNS][5] = {
     "TV0 ", "TV1 ", "TV2 ", "TV3 ", "TV4 ", "TM0 ", "TM1 ", "TM2 ", "TM3 ", "TM4 ",
     "TS0 ", "TS1 ", "TS2 ", "TS3 ", "TS4 ", "TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
 
+// Makes room for the trainer's chunks and `more` bytes at once: a buffer that grows step by step is there twice each time.
+// There is some left for what the caller appends; memory that is not touched takes no space.
+static void gsf__trainer_reserve_chunks(gsf_context* ctx, const gsf_trainer* trainer, size_t more, gsf_buffer* chunks) {
+    const gsf__model* model = &trainer->model;
+    gsf__column columns[GSF__COLUMNS];
+    gsf__model_columns(model, columns);
+    size_t bytes = more + GSF__STATE_SIZE + gsf__model_blocks(model->count) + (size_t)(GSF__SAVED_COLUMNS + 3) * 32;
+    for (int k = 0; k < GSF__SAVED_COLUMNS; k++) bytes += model->count * columns[k].row;
+    if (!chunks->failed && gsf__reserve(ctx, (void**)&chunks->data, &chunks->capacity, chunks->size,
+                                        chunks->size + bytes + bytes / 16 + 4096, 1) != GSF_OK)
+        chunks->failed = 1;
+}
+
 GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* trainer, gsf_buffer* chunks) {
     const gsf__model* model = &trainer->model;
+    gsf__trainer_reserve_chunks(ctx, trainer, 0, chunks);
     char state[GSF__STATE_SIZE];
     const uint32_t mark = GSF__BYTE_ORDER_MARK;
     uint32_t weight;
@@ -14164,7 +14178,7 @@ static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_c
         GSF__TRY(gsf__check_cancel(ctx));
         GSF__TRY(gsf__fit_image(ctx, f->rendered + i, camera, 3));
         GSF__TRY(gsf__fit_image(ctx, f->depth + i, camera, 1));
-        GSF__TRY(gsf__fit_image(ctx, f->alpha + i, camera, 1));
+        if (f->limits.needs_alpha) GSF__TRY(gsf__fit_image(ctx, f->alpha + i, camera, 1));
         GSF__TRY(gsf__fit_image(ctx, f->restored + i, camera, 3));
         GSF__TRY(gsf__fit_image(ctx, f->confidence + i, camera, 1));
         gsf_render_output out;
@@ -14332,6 +14346,10 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
                         fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W bytes of confidence */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
+static size_t gsf__frame_bytes(const gsf_camera* camera) {
+    return GSF__FRAME_HEAD + 4 * (size_t)camera->width * (size_t)camera->height;
+}
+
 static size_t gsf__open_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, size_t count) {
     char head[8];
     const size_t opened = gsf__open_chunk(ctx, chunks, tag); // written in place: frames make up most of a checkpoint
@@ -14398,7 +14416,7 @@ static size_t gsf__parse_frame(gsf_context* ctx, const char* p, size_t left, gsf
     camera->width = (int32_t)gsf__load_le(p + 160, 4);
     camera->height = (int32_t)gsf__load_le(p + 164, 4);
     if (gsf_check_camera(ctx, camera) != GSF_OK || camera->width > 65536 || camera->height > 65536) return 0;
-    const size_t bytes = GSF__FRAME_HEAD + 4 * (size_t)camera->width * (size_t)camera->height;
+    const size_t bytes = gsf__frame_bytes(camera);
     return bytes <= left ? bytes : 0;
 }
 
@@ -14424,6 +14442,10 @@ static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const voi
 }
 
 GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* f, gsf_buffer* chunks) {
+    size_t bytes = 256;
+    for (size_t i = 0; i < f->pending.count; i++) bytes += gsf__frame_bytes(&f->pending.frames[i].camera);
+    for (size_t i = 0; i < f->trainer->restored.count; i++) bytes += gsf__frame_bytes(&f->trainer->restored.photos[i].camera);
+    gsf__trainer_reserve_chunks(ctx, f->trainer, bytes, chunks);
     gsf_splat_format_trainer(ctx, f->trainer, chunks);
     const int32_t numbers[7] = {1, f->trainer->iteration, f->round, f->restoring, f->window, f->desc.windows, f->skipped};
     char body[28];

@@ -200,7 +200,6 @@ typedef struct fix_run {
     gsfix_history history;
     double total_before; // seconds spent by the earlier runs that this one continues
     int32_t iteration, iterations, eval_every, checkpoint_every;
-    size_t checkpoint_bytes; // size of the last checkpoint
     double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds for the last one and for all; end time of the last
 } fix_run;
 
@@ -568,9 +567,6 @@ static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_buffer chunks = {0}, history = {0};
     const double begin = gsfix_now();
-    const size_t room = 2 * run->checkpoint_bytes; // never moved, then; what is not touched takes no memory
-    chunks.data = room ? (char*)gsf_alloc(ctx, room, 1) : NULL;
-    chunks.capacity = chunks.data ? room : 0;
     write_history(run, &history);
     gsf_splat_format_fixer(ctx, run->fixer, &chunks);
     gsf_append_chunk(ctx, &chunks, "GFIX", history.data, history.size);
@@ -578,7 +574,6 @@ static gsf_result save_checkpoint(fix_run* run) {
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     if (!history.failed && !chunks.failed)
         result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks.data, chunks.size);
-    run->checkpoint_bytes = chunks.size;
     gsf_destroy_buffer(ctx, &chunks);
     gsf_destroy_buffer(ctx, &history);
     run->checkpoint_end = gsfix_now();
@@ -589,9 +584,10 @@ static gsf_result save_checkpoint(fix_run* run) {
 
 // Decides whether to write a checkpoint at a point where one may be written; the result of the run does not depend on it.
 // Together with the next one and the last, which is always written, checkpoints take less than 2 % of the elapsed time.
-static int checkpoint_pays(const fix_run* run) {
+// Within a round, whose frames take much memory, one is written at most every minute.
+static int checkpoint_pays(const fix_run* run, int within_round) {
     const double now = gsfix_now();
-    return now - run->checkpoint_end >= 1.0 &&
+    return now - run->checkpoint_end >= (within_round ? 60.0 : 1.0) &&
            run->checkpoint_sum + 2.0 * run->checkpoint_last <= 0.02 * (now - run->app->started);
 }
 
@@ -994,7 +990,7 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
     }
     add_seconds(run, GSFIX_SAVE, clock);
     if (stats->stage == GSF_FIX_TRAIN && run->iteration == run->iterations) due = 1;
-    else if (due && !run->app->o.checkpoint_every) due = checkpoint_pays(run);
+    else if (due && !run->app->o.checkpoint_every) due = checkpoint_pays(run, stats->stage == GSF_FIX_RESTORE);
     if (result == GSF_OK && due) keep_checkpoint(run);
     add_seconds(run, GSFIX_CHECKPOINT, clock);
     return result;

@@ -911,8 +911,11 @@ static void test_failed_restore(void) {
         CHECK_OK(&ctx, gsf_splat_step_fixer(&ctx, first, &stats));
         round = stats.stage == GSF_FIX_RESTORE ? stats.round : 0;
     }
+    const int calls = (int)memory.calls;
     gsf_splat_format_fixer(&ctx, first, &chunks);
     gsf_append_last_chunk(&ctx, &chunks);
+    CHECK((int)memory.calls - calls <= 2); // the buffer at its full size, and pixels of a frame: never two buffers
+    CHECK(chunks.capacity <= chunks.size + chunks.size / 15 + 8192);
     gsf_splat_destroy_fixer(&ctx, first);
     CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &second));
     gsf_splat_format_fixer(&ctx, second, &untouched);
