@@ -8266,14 +8266,17 @@ enum {
 
 // 2^x for x in [-126, 1], relative error below 2e-7 (minimax polynomial of degree 5 on [-1/2, 1/2]).
 static float gsf__exp2_fast(float x) {
-    const float k = floorf(x + 0.5f), f = x - k;
+    const float above = x + 0.5f;
+    int32_t k = (int32_t)above;
+    k -= (float)k > above; // rounds down, without floorf, which takes longer before SSE 4.1
+    const float f = x - (float)k;
     float p = 1.3276404e-3f;
     p = p * f + 9.6755413e-3f;
     p = p * f + 5.5507135e-2f;
     p = p * f + 0.24022120f;
     p = p * f + 0.69314694f;
     p = p * f + 1.0000001f;
-    const int32_t bits = ((int32_t)k + 127) << 23;
+    const int32_t bits = (k + 127) << 23;
     float scale;
     memcpy(&scale, &bits, sizeof scale);
     return p * scale;
@@ -8293,10 +8296,10 @@ static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, 
         if (!(half2 >= 0.0f)) continue;
         const float half = sqrtf(half2) + 0.02f;
         const float left = center[row] - half, right = center[row] + half;
-        for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
-            const float first = (float)(GSF__STRIP * strip);
-            if (left <= first + (float)(GSF__STRIP - 1) && right >= first) mask |= 1u << (8 * strip + row / 2);
-        }
+        if (!(left <= (float)(GSF__TILE - 1) && right >= 0.0f)) continue;
+        const int first = (left > 3.0f) + (left > 7.0f) + (left > 11.0f); // strips first..last; none if first > last
+        const int last = (right >= 4.0f) + (right >= 8.0f) + (right >= 12.0f);
+        mask |= (0x01010101u << 8 * first & 0x01010101u >> (24 - 8 * last)) << row / 2;
     }
     return mask;
 }
@@ -8345,12 +8348,12 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
-            const int s = gsf__lowest_bit(m);
+            const int s = gsf__lowest_bit(m), row = gsf__step_row(s, 0);
             int open = 0;
             for (int lane = 0; lane < 8; lane++) {
-                const int k = 8 * s + lane, row = gsf__step_row(s, lane);
+                const int k = 8 * s + lane;
                 const float T = state->T[k], column = (float)gsf__step_column(s, lane);
-                const float raw = gsf__blend_pixel(rec, column, center[row], exponent[row], &state->T[k]);
+                const float raw = gsf__blend_pixel(rec, column, center[row + lane % 2], exponent[row + lane % 2], &state->T[k]);
                 const float w = (raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX) * T;
                 if (raw > 0.0f) {
                     state->r[k] += w * rec->r;
@@ -8400,6 +8403,14 @@ GSF__INLINE_AVX2 const gsf__record* gsf__batch_entry(const gsf__tile* tile, size
     return rec;
 }
 
+// Bits of the pairs of rows whose interval from..to overlaps the strip that begins at column `first`.
+GSF__INLINE_AVX2 uint32_t gsf__strip_avx2(__m256 from, __m256 to, float first) {
+    const __m256 last = _mm256_set1_ps(first + (float)(GSF__STRIP - 1));
+    const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ),
+                                     _mm256_cmp_ps(to, _mm256_set1_ps(first), _CMP_GE_OQ));
+    return (uint32_t)_mm256_movemask_ps(met);
+}
+
 // Like gsf__rows_scalar, 8 rows at a time.
 GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float v, float center[GSF__TILE],
                                          float exponent[GSF__TILE]) {
@@ -8423,26 +8434,20 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float 
     __m256 to = _mm256_max_ps(_mm256_shuffle_ps(right[0], right[1], 0x88), _mm256_shuffle_ps(right[0], right[1], 0xdd));
     from = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(from), 0xd8));
     to = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(to), 0xd8));
-    uint32_t mask = 0;
-    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
-        const float column = (float)(GSF__STRIP * strip);
-        const __m256 first = _mm256_set1_ps(column), last = _mm256_set1_ps(column + (float)(GSF__STRIP - 1));
-        const __m256 met = _mm256_and_ps(_mm256_cmp_ps(from, last, _CMP_LE_OQ), _mm256_cmp_ps(to, first, _CMP_GE_OQ));
-        mask |= (uint32_t)_mm256_movemask_ps(met) << (8 * strip);
-    }
-    return mask;
+    return gsf__strip_avx2(from, to, 0.0f) | gsf__strip_avx2(from, to, 4.0f) << 8 |
+           gsf__strip_avx2(from, to, 8.0f) << 16 | gsf__strip_avx2(from, to, 12.0f) << 24;
 }
 
 GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
-    const __m256 k = _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    const __m256 f = _mm256_sub_ps(x, k);
+    const __m256 rounder = _mm256_set1_ps(12582912.0f); // leaves the nearest integer, ties to even, in the low bits
+    const __m256 rounded = _mm256_add_ps(x, rounder), f = _mm256_sub_ps(x, _mm256_sub_ps(rounded, rounder));
     __m256 p = _mm256_set1_ps(1.3276404e-3f);
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(9.6755413e-3f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(5.5507135e-2f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.24022120f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.69314694f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(1.0000001f));
-    const __m256i shift = _mm256_slli_epi32(_mm256_cvtps_epi32(k), 23);
+    const __m256i shift = _mm256_slli_epi32(_mm256_castps_si256(rounded), 23);
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
@@ -8484,7 +8489,15 @@ GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 T, __m256 alpha, __m256* weight, _
 
 GSF__INLINE_AVX2 uint32_t gsf__live_avx2(const float* T) {
     uint32_t live = 0;
-    for (uint32_t s = 0; s < GSF__STEPS; s++) live |= (uint32_t)(_mm256_movemask_ps(_mm256_loadu_ps(T + 8 * s)) != 255) << s;
+    for (uint32_t s = 0; s < GSF__STEPS; s += 4) { // packs the signs of four steps; each half has four pixels of a step
+        __m256i v[4];
+        for (uint32_t k = 0; k < 4; k++) v[k] = _mm256_castps_si256(_mm256_loadu_ps(T + 8 * (s + k)));
+        const __m256i signs = _mm256_packs_epi16(_mm256_packs_epi32(v[0], v[1]), _mm256_packs_epi32(v[2], v[3]));
+        const __m128i sign = _mm_set1_epi8(-128);
+        const __m128i both = _mm_and_si128(_mm256_castsi256_si128(signs), _mm256_extracti128_si256(signs, 1));
+        const __m128i closed = _mm_cmpeq_epi32(_mm_and_si128(both, sign), sign);
+        live |= (uint32_t)(_mm_movemask_ps(_mm_castsi128_ps(closed)) ^ 15) << s;
+    }
     return live;
 }
 
@@ -8829,12 +8842,13 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
             const gsf__step* step = steps + k - 1;
             const int s = (int)heads[k - 1].step;
+            const float dys[2] = {(float)gsf__step_row(s, 0) - v, (float)gsf__step_row(s, 1) - v};
+            const float centers[2] = {u + rec->kx * dys[0], u + rec->kx * dys[1]};
             for (int lane = 0; lane < 8; lane++) {
                 const float raw = step->alpha[lane];
                 if (!(raw > 0.0f)) continue;
                 const int at = 8 * s + lane;
-                const float dy = (float)gsf__step_row(s, lane) - v, center = u + rec->kx * dy;
-                const float e = (float)gsf__step_column(s, lane) - center;
+                const float dy = dys[lane % 2], e = (float)gsf__step_column(s, lane) - centers[lane % 2];
                 const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX, w = alpha * step->T[lane];
                 float F = rec->r * gradient->r[at] + rec->g * gradient->g[at] + rec->b * gradient->b[at];
                 if (flags & GSF__WITH_DEPTH) F += rec->depth * gradient->z[at] + gradient->a[at];
@@ -9543,8 +9557,10 @@ static void gsf__tile_extent(const gsf_rasterizer* r, const gsf__tile* tile, int
     *rows = r->height - (int)tile->y0 < GSF__TILE ? r->height - (int)tile->y0 : GSF__TILE;
 }
 
-// Index in the arrays of a tile of the first pixel of row y in strip k; the next pixels of the row follow at distance 2.
-static int gsf__strip_pixel(int k, int y) { return GSF__STRIP * GSF__TILE * k + 8 * (y / 2) + y % 2; }
+// Index in the arrays of a tile of the pixel in column x, row y; the next pixels of its row and strip follow at distance 2.
+static int gsf__tile_pixel(int x, int y) {
+    return GSF__STRIP * GSF__TILE * (x / GSF__STRIP) + 8 * (y / 2) + y % 2 + 2 * (x % GSF__STRIP);
+}
 
 // Number of pixels of a row of strip k that lie inside the image, 0..4.
 static int gsf__strip_width(int k, int columns) {
@@ -9557,7 +9573,7 @@ static void gsf__open_tile(float* T, int columns, int rows) {
     for (int i = 0; i < GSF__TILE_PIXELS; i++) T[i] = 1.0f;
     for (int y = 0; y < GSF__TILE && (columns < GSF__TILE || rows < GSF__TILE); y++)
         for (int x = y < rows ? columns : 0; x < GSF__TILE; x++)
-            T[gsf__strip_pixel(x / GSF__STRIP, y) + 2 * (x % GSF__STRIP)] = -1.0f;
+            T[gsf__tile_pixel(x, y)] = -1.0f;
 }
 
 static void gsf__put_pixel(const gsf_image* image, int64_t x, int64_t y, int channel, float value) {
@@ -9572,15 +9588,14 @@ static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int ch
     return value;
 }
 
-// The colours of `width` pixels of a row in a strip, over the background, and their T.
-static inline void gsf__row_colors(const gsf__tile_state* state, int at, int width, const float background[3], float* rgb,
-                                   float* T) {
-    for (int i = 0; i < width; i++) {
-        const int k = at + 2 * i;
-        T[i] = fabsf(state->T[k]);
-        rgb[3 * i] = state->r[k] + T[i] * background[0];
-        rgb[3 * i + 1] = state->g[k] + T[i] * background[1];
-        rgb[3 * i + 2] = state->b[k] + T[i] * background[2];
+// The colours of a tile's row over the background, and their T.
+static inline void gsf__row_colors(const gsf__tile_state* state, int row, const float background[3], float* rgb, float* T) {
+    for (int x = 0; x < GSF__TILE; x++) {
+        const int k = gsf__tile_pixel(x, row);
+        T[x] = fabsf(state->T[k]);
+        rgb[3 * x] = state->r[k] + T[x] * background[0];
+        rgb[3 * x + 1] = state->g[k] + T[x] * background[1];
+        rgb[3 * x + 2] = state->b[k] + T[x] * background[2];
     }
 }
 
@@ -9594,29 +9609,28 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     gsf__tile_extent(r, &tile, &columns, &rows);
     memset(&state, 0, sizeof state);
     gsf__open_tile(state.T, columns, rows);
+    for (int row = 0; row < rows; row++) // to be written after the blending
+        gsf__v_fetch_scalar(r->final_T + (size_t)((int64_t)tile.y0 + row) * (size_t)r->width + (size_t)tile.x0);
     job->kernels.blend(&tile, &state, job->flags);
     const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
     const int packed = color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float);
-    for (int q = 0; q < GSF__TILE / GSF__STRIP * rows; q++) {
-        const int strip = q % (GSF__TILE / GSF__STRIP), row = q / (GSF__TILE / GSF__STRIP);
-        const int width = gsf__strip_width(strip, columns), at = gsf__strip_pixel(strip, row);
-        const int64_t x = (int64_t)tile.x0 + GSF__STRIP * strip, y = (int64_t)tile.y0 + row;
-        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
-        float rgb[3 * GSF__STRIP], T[GSF__STRIP];
-        if (width == GSF__STRIP && packed && color->data) { // most rows: loops and copies of constant length
-            gsf__row_colors(&state, at, GSF__STRIP, job->view->background, rgb, T);
+    for (int row = 0; row < rows; row++) {
+        const int64_t x0 = (int64_t)tile.x0, y = (int64_t)tile.y0 + row;
+        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x0;
+        float rgb[3 * GSF__TILE], T[GSF__TILE];
+        gsf__row_colors(&state, row, job->view->background, rgb, T);
+        if (columns == GSF__TILE && packed && color->data) { // most rows: copies of constant length
             memcpy(r->final_T + pixel, T, sizeof T);
-            memcpy((char*)color->data + y * color->stride_y + x * color->stride_x, rgb, sizeof rgb);
+            memcpy((char*)color->data + y * color->stride_y + x0 * color->stride_x, rgb, sizeof rgb);
         } else {
-            gsf__row_colors(&state, at, width, job->view->background, rgb, T);
-            if (width) memcpy(r->final_T + pixel, T, (size_t)width * sizeof(float));
-            for (int k = 0; k < 3 * width && color->data; k++) gsf__put_pixel(color, x + k / 3, y, k % 3, rgb[k]);
+            memcpy(r->final_T + pixel, T, (size_t)columns * sizeof(float));
+            for (int k = 0; k < 3 * columns && color->data; k++) gsf__put_pixel(color, x0 + k / 3, y, k % 3, rgb[k]);
         }
-        for (int lane = 0; lane < width && r->has_depth; lane++) r->depth_sum[pixel + (size_t)lane] = state.z[at + 2 * lane];
-        for (int lane = 0; lane < width && (alpha->data || depth->data); lane++) {
-            const float a = 1.0f - T[lane], z = state.z[at + 2 * lane];
-            if (alpha->data) gsf__put_pixel(alpha, x + lane, y, 0, a);
-            if (depth->data) gsf__put_pixel(depth, x + lane, y, 0, T[lane] < 1.0f ? z / a : 0.0f);
+        for (int x = 0; x < columns && (r->has_depth || alpha->data || depth->data); x++) {
+            const float a = 1.0f - T[x], z = state.z[gsf__tile_pixel(x, row)];
+            if (r->has_depth) r->depth_sum[pixel + (size_t)x] = z;
+            if (alpha->data) gsf__put_pixel(alpha, x0 + x, y, 0, a);
+            if (depth->data) gsf__put_pixel(depth, x0 + x, y, 0, T[x] < 1.0f ? z / a : 0.0f);
         }
     }
 }
@@ -9675,7 +9689,7 @@ static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile*
     memset(gradient, 0, sizeof *gradient);
     for (int q = 0; q < GSF__TILE / GSF__STRIP * rows; q++) {
         const int strip = q % (GSF__TILE / GSF__STRIP), row = q / (GSF__TILE / GSF__STRIP);
-        const int width = gsf__strip_width(strip, columns), first = gsf__strip_pixel(strip, row);
+        const int width = gsf__strip_width(strip, columns), first = gsf__tile_pixel(GSF__STRIP * strip, row);
         const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)((int)tile->x0 + GSF__STRIP * strip);
         if (job->d_color && width == GSF__STRIP)
             gsf__row_gradient(job->d_color + 3 * pixel, first, GSF__STRIP, job->view->background, gradient);
