@@ -3,7 +3,7 @@
 /* Sample b of step t depends on the seed, t and b only. Augmentations act on all planes of a crop alike: mirrored, transposed,
    channels of colours in another order, less or more saturated, another gamma and exposure. Some hide evidence: references that
    show nothing, or nothing by one of the two ways; holes in the render. Others make the input better than splats of few photos
-   are: a fifth of the renders is partly the truth, so that the network sees pixels which it must leave alone. */
+   are, if asked for: a share of the renders is partly the truth, so that the network sees pixels which it must leave alone. */
 #ifndef MINI_BATCHES_H
 #define MINI_BATCHES_H
 
@@ -17,7 +17,7 @@ typedef struct mini_batch {
     int64_t crop, count, step;          // count: samples of a batch
     size_t first;                       // the sample of the batch that samples[0] is
     uint64_t seed;
-    int plain;                          // no augmentation
+    double better;                      // share of renders that are partly the truth
     mini_sample* samples;               // of a part of the batch
 } mini_batch;
 
@@ -142,7 +142,7 @@ static void make_sample(void* arg, size_t index, int32_t worker) {
     const int64_t x0 = (int64_t)((double)(width - crop + 1) * draw_of(b, sample, 3));
     const int mirror = draw_of(b, sample, 4) < 0.5, flip = draw_of(b, sample, 5) < 0.5, swap = draw_of(b, sample, 6) < 0.5;
     const tone_curve curve = draw_tone(b, sample);
-    const float fault = draw_of(b, sample, 7) < 0.2 ? (float)exp(-3.5 * draw_of(b, sample, 8)) : 1.0f; // down to -30 dB
+    const float fault = draw_of(b, sample, 7) < b->better ? (float)exp(-3.5 * draw_of(b, sample, 8)) : 1.0f; // down to -30 dB
     (void)worker;
     for (int64_t y = 0; y < crop; y++)
         for (int64_t x = 0; x < crop; x++) {

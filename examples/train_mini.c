@@ -4,14 +4,15 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
-           [--pixels 216] [--fit 599] [--groups 1] [--int8]
+           [--pixels 216] [--fit 599] [--groups 1] [--better 0] [--int8]
 
    --scenes and --check: seeds, such as 1001-1040,1055. DIR gets a file for each (mini_data.h), unless it is there already. The
    network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16 or, with
    --int8, all kernels in 8-bit integers. OUT.state: what --resume continues from, written every --save-every steps; a run that
    was killed and resumed ends with the same bytes, as do runs with other numbers of threads. --quick: 4000 steps, ten minutes
    on one core. --init starts from the weights of a file. --pixels: longer side of the photos; --fit: step of the last round, of
-   which there are three. --groups N: the batch is added up in N parts (training.h), which up to N ranks share: with
+   which there are three. --better: share of the samples whose render is partly the truth; with 0.2 the network learns to keep
+   what is right, but repairs less. --groups N: the batch is added up in N parts (training.h), which up to N ranks share: with
    -DGSF_USE_MPI, compiled by mpicc,
        mpirun -np 2 train_mini ... --groups 2
    writes the bytes of the same command on one rank. OUT.loss.csv and OUT.loss.html: loss of every step, and its curve. */
@@ -38,7 +39,7 @@ typedef struct options {
     seeds scenes, check;
     int steps, batch, crop, save_every, threads, resume, make_only, int8, pixels, fit, groups;
     uint64_t seed;
-    double rate;
+    double rate, better;
 } options;
 
 typedef struct training {
@@ -154,6 +155,7 @@ static gsf_result make_batches(training* t) {
     t->batch.crop = t->o.crop;
     t->batch.count = t->o.batch;
     t->batch.seed = t->o.seed;
+    t->batch.better = t->o.better;
     const gsf_result result = training_begin_sum(&t->ctx, t->ranks, t->o.groups, t->params.count, &t->sum);
     if (result != GSF_OK) return result;
     return gsf__mini_begin(&t->ctx, &t->net, t->o.batch / t->o.groups, DATA_REFERENCES, t->o.crop, t->o.crop, 1, &t->run);
@@ -392,7 +394,7 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
                 "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1] [--int8]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1] [--better 0] [--int8]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -438,6 +440,7 @@ static int parse_options(int argc, char** argv, options* o) {
             else if (strcmp(name, "--batch") == 0) o->batch = (int)x;
             else if (strcmp(name, "--crop") == 0) o->crop = (int)x;
             else if (strcmp(name, "--rate") == 0) o->rate = x;
+            else if (strcmp(name, "--better") == 0) o->better = x;
             else if (strcmp(name, "--seed") == 0) o->seed = (uint64_t)x;
             else if (strcmp(name, "--save-every") == 0) o->save_every = (int)x;
             else if (strcmp(name, "--threads") == 0) o->threads = (int)x;
@@ -448,7 +451,7 @@ static int parse_options(int argc, char** argv, options* o) {
         }
     }
     return o->out && o->data && seed_count(&o->scenes) && o->steps > 0 && o->batch > 0 && o->batch <= 64 && o->save_every > 0 &&
-           training_is_power(o->groups) && o->batch % o->groups == 0 &&
+           o->better <= 1.0 && training_is_power(o->groups) && o->batch % o->groups == 0 &&
            o->crop >= 16 && o->crop % GSF__MINI_MULTIPLE == 0 && o->fit >= 3 && o->pixels >= 24 && o->pixels <= 4096 &&
            2 * o->pixels / 3 >= o->crop;
 }
