@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Updates the tables of measured figures in README.md. The blocks between its markers are generated from bench/results.csv
-(written by bench/run.sh) and bench/quality.csv (written by bench/quality.py).
+(written by bench/run.sh) and bench/scenes.csv (written by bench/scenes.py).
 
     bench/readme.py [--check]
 
@@ -28,6 +28,11 @@ KERNELS = [  # case, variant, name in README
     ("dinov2 f32 350x518 L=24", "default", "DINOv2-L, one photo of 350 x 518"),
     ("vggt pair f32 350x518 N=2", "default", "one frame and one global block of VGGT, two photos"),
 ]
+
+ARMS = {"plain": "plain 3DGS", "none": "with regularisers", "warp": "and `warp`", "mini": "and `mini`"}
+SCENES = {"fox": "stuffed fox on a wall", "Herz-Jesus-P25": "church facade", "kermit": "puppet", "bear": "plush bear",
+          "archmodel": "wooden building model", "kitchen": "toy bulldozer", "monstree": "tree with a carved face",
+          "plush": "doll on a bed"}
 
 
 def read(name):
@@ -63,18 +68,24 @@ def speed(rows):
     return lines
 
 
+def figures(found):
+    """Means over seeds, then over scenes: PSNR / SSIM."""
+    of_scene = [[statistics.mean(float(r[k]) for r in found if r["scene"] == scene) for k in ("psnr", "ssim")]
+                for scene in dict.fromkeys(r["scene"] for r in found)]
+    return "%.2f / %.3f" % tuple(statistics.mean(column) for column in zip(*of_scene)) if of_scene else ""
+
+
 def quality(rows):
-    """Means over the seeds: PSNR over the seen pixels; over all pixels in brackets."""
-    arms = ["plain", "none", "warp"] + sorted({r["arm"] for r in rows} - {"plain", "none", "warp"})
-    head = {"plain": "plain 3DGS", "none": "with regularisers", "warp": "and `warp`"}
-    lines = ["| start | photos | " + " | ".join(head.get(a, a) for a in arms) + " |", "|---|---|" + "---|" * len(arms)]
-    for start, views in dict.fromkeys((r["start"], r["views"]) for r in rows):
-        cells = []
-        for arm in arms:
-            found = [r for r in rows if (r["start"], r["views"], r["arm"]) == (start, views, arm)]
-            cells.append("%.2f (%.2f)" % tuple(statistics.mean(float(r[k]) for r in found) for k in ("psnr_seen", "psnr"))
-                         if found else "")
-        lines.append("| %s | %s | %s |" % (start, views, " | ".join(cells)))
+    """Means over the scenes for each number of photos, then each scene with three photos."""
+    head = "| %s | " + " | ".join(ARMS.values()) + " |"
+    lines = [head % "photos", "|---|" + "---|" * len(ARMS)]
+    for views in dict.fromkeys(r["views"] for r in rows):
+        cells = [figures([r for r in rows if (r["views"], r["arm"]) == (views, arm)]) for arm in ARMS]
+        lines.append("| %s | %s |" % (views, " | ".join(cells)))
+    lines += ["", head % "scene, 3 photos", "|---|" + "---|" * len(ARMS)]
+    for scene in dict.fromkeys(r["scene"] for r in rows):
+        cells = [figures([r for r in rows if (r["scene"], r["views"], r["arm"]) == (scene, "3", arm)]) for arm in ARMS]
+        lines.append("| %s | %s |" % (SCENES.get(scene, scene), " | ".join(cells)))
     return lines
 
 
@@ -85,7 +96,7 @@ def main():
     with open(path) as file:
         text = file.read()
     fresh = text
-    for name, source, make in (("speed", "results.csv", speed), ("quality", "quality.csv", quality)):
+    for name, source, make in (("speed", "results.csv", speed), ("quality", "scenes.csv", quality)):
         rows = read(source)
         if rows is None:
             continue
