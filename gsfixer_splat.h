@@ -9609,11 +9609,16 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     gsf__tile_extent(r, &tile, &columns, &rows);
     memset(&state, 0, sizeof state);
     gsf__open_tile(state.T, columns, rows);
-    for (int row = 0; row < rows; row++) // to be written after the blending
-        gsf__v_fetch_scalar(r->final_T + (size_t)((int64_t)tile.y0 + row) * (size_t)r->width + (size_t)tile.x0);
-    job->kernels.blend(&tile, &state, job->flags);
     const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
     const int packed = color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float);
+    for (int row = 0; row < rows; row++) { // to be written after the blending
+        const int64_t x0 = (int64_t)tile.x0, y = (int64_t)tile.y0 + row;
+        gsf__v_fetch_scalar(r->final_T + (size_t)y * (size_t)r->width + (size_t)x0);
+        const char* line = (const char*)color->data;
+        for (int x = 0; x < columns && packed && line; x += 5) // 60 bytes each
+            gsf__v_fetch_scalar((const float*)(const void*)(line + y * color->stride_y + (x0 + x) * color->stride_x));
+    }
+    job->kernels.blend(&tile, &state, job->flags);
     for (int row = 0; row < rows; row++) {
         const int64_t x0 = (int64_t)tile.x0, y = (int64_t)tile.y0 + row;
         const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x0;
