@@ -9850,7 +9850,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 //     a = (1 - q) (D - p mu) / B1 + (S - k z) e_s - (D - c - k D) e_d
 // and the gradient at pixel i is 1/4 d(1 - SSIM)/dx(i) = G*a + (d(i) - c) G*e_d - s(i) G*e_s.
 //
-// Images stay interleaved: a row is 3W floats, padded to a multiple of 16, and horizontal taps are 3 floats apart. Rows
+// Images stay interleaved: a row is 3W floats, padded to whole vectors, and horizontal taps are 3 floats apart. Rows
 // are processed in groups of four, which share the loads of their vertical sums. Each worker streams a band of rows
 // through two ring buffers:
 //     images   s, d, s^2, (d - c)^2                         5 groups, starting at row first - 10 of the band
@@ -9926,6 +9926,13 @@ GSF__V_INLINE gsf__vf GSF__V(gsf__loss_clamp)(gsf__vf v) { // NaN: 0
     return gsf__v_min(gsf__v_max(v, gsf__v_set(0.0f)), gsf__v_set(1.0f));
 }
 
+// A byte divided by 255. The fused form gives the quotient's bits for all 256, without a division.
+GSF__V_INLINE gsf__vf GSF__V(gsf__loss_unit)(gsf__vf byte) {
+    const float high = 1.0f / 255.0f, low = (float)(1.0 / 255.0 - (double)high);
+    if (GSF__LANES < 8) return byte / gsf__v_set(255.0f); // gsf__v_madd is fused with 8 lanes and more
+    return gsf__v_madd(byte, gsf__v_set(high), byte * gsf__v_set(low));
+}
+
 GSF__V_KERNEL void GSF__V(gsf__loss_load)(const float* render, const float* f32, const uint8_t* u8, const float* b,
                                           const float* c, size_t valid, size_t n, float* images, size_t step) {
     for (size_t i = 0; i < n; i += GSF__LANES) {
@@ -9933,7 +9940,7 @@ GSF__V_KERNEL void GSF__V(gsf__loss_load)(const float* render, const float* f32,
         gsf__vf x = gsf__v_set(0.0f), t = x;
         if (left) {
             x = GSF__V(gsf__loss_clamp)(gsf__v_load_first(render + i, left));
-            if (u8) t = gsf__v_load_bytes(u8 + i, left) / gsf__v_set(255.0f);
+            if (u8) t = GSF__V(gsf__loss_unit)(gsf__v_load_bytes(u8 + i, left));
             else t = GSF__V(gsf__loss_clamp)(gsf__v_load_first(f32 + i, left));
         }
         const gsf__vf s = (x - gsf__v_load(b + i)) + t, d = x - t, e = d - gsf__v_load(c + i);
@@ -10121,11 +10128,15 @@ typedef struct gsf__loss_buffers { // of a worker processing a band; pointers ar
     int32_t first, end;                                // rows of the band
 } gsf__loss_buffers;
 
-static size_t gsf__loss_padded(int32_t width) { return (3 * (size_t)width + 15) & ~(size_t)15; }
+// Floats of a row, rounded up to whole vectors.
+static size_t gsf__loss_padded(gsf_cpu_level level, int32_t width) {
+    const size_t lanes = level >= GSF_CPU_AVX512 ? 16 : 8;
+    return (3 * (size_t)width + lanes - 1) & ~(lanes - 1);
+}
 
 // Floats of a row with its margins: an odd number of cache lines, so that rows do not compete for the same cache sets.
 static size_t gsf__loss_row(int32_t width) {
-    return ((gsf__loss_padded(width) + 2 * GSF__LOSS_MARGIN + 15) & ~(size_t)15) | 16;
+    return ((3 * (size_t)width + 2 * GSF__LOSS_MARGIN + 15) & ~(size_t)15) | 16;
 }
 
 // Rows per band: at most GSF__LOSS_BAND, chosen to give bands of about equal height.
@@ -10315,7 +10326,7 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
     job.sums = scratch->sums;
     job.d_render = d_render;
     job.valid = 3 * (size_t)target->width;
-    job.n = gsf__loss_padded(target->width);
+    job.n = gsf__loss_padded(ctx->cpu_level, target->width);
     job.row = gsf__loss_row(target->width);
     const double n = 3.0 * (double)target->width * (double)target->height;
     job.l1_scale = (float)((double)scale * (1.0 - (double)lambda) / n);
