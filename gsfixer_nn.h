@@ -3196,16 +3196,22 @@ GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float sca
     const int64_t whole = count / GSF__LANES * GSF__LANES;
     const size_t left = (size_t)(count - whole);
     const gsf__vm first = gsf__vm_first(left);
-    const gsf__vf tail = gsf__v_load_first(x + whole, left);
-    gsf__vf top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest), top1 = top0; // NaNs are ignored
+    gsf__vf top0 = lowest, top1 = lowest, tail = lowest, last = lowest; // NaNs are ignored
+    double sum = 0.0;
+    if (left) {
+        tail = gsf__v_load_first(x + whole, left);
+        top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest);
+    }
     for (int64_t i = 0; i + GSF__LANES < whole; i += 2 * GSF__LANES) {
         top0 = gsf__v_max(factor * gsf__v_load(x + i), top0);
         top1 = gsf__v_max(factor * gsf__v_load(x + i + GSF__LANES), top1);
     }
     if (whole / GSF__LANES % 2) top0 = gsf__v_max(factor * gsf__v_load(x + whole - GSF__LANES), top0);
     const gsf__vf top = gsf__v_set(gsf__v_largest(gsf__v_max(top0, top1)));
-    const gsf__vf last = gsf__v_keep(first, gsf__v_exp2_low(&terms, gsf__v_msub(tail, factor, top)));
-    double sum = (double)gsf__v_sum(last);
+    if (left) {
+        last = gsf__v_keep(first, gsf__v_exp2_low(&terms, gsf__v_msub(tail, factor, top)));
+        sum = (double)gsf__v_sum(last);
+    }
     for (int64_t begin = 0; begin < whole; begin += 64 * GSF__LANES) { // sum short runs in float
         const int64_t end = gsf__least(begin + 64 * GSF__LANES, whole);
         gsf__vf part = gsf__v_set(0.0f);
