@@ -78,7 +78,7 @@ export CC=gcc CXX=g++
 build_tree gcc "$build" -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TEST_SCALAR=ON
 export CC=clang-14 CXX=clang++-14
 # Inlining only functions marked inline saves a quarter of the compile time without slowing the tests down.
-flags="-O1 -g -finline-hint-functions"
+flags="-O1 -gline-tables-only -finline-hint-functions"
 clang=(-DCMAKE_BUILD_TYPE=Sanitize "-DCMAKE_C_FLAGS=$flags" "-DCMAKE_CXX_FLAGS=$flags" -DGSFIXER_BENCH=OFF)
 build_tree asan "$build/asan" "${clang[@]}" -DGSFIXER_SANITIZE=address,undefined -DGSFIXER_TEST_PREFIX=asan.
 build_tree tsan "$build/tsan" "${clang[@]}" -DGSFIXER_SANITIZE=thread -DGSFIXER_TEST_PREFIX=tsan. -DGSFIXER_OPENMP=OFF \
