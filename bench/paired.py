@@ -11,6 +11,7 @@ import argparse
 import json
 import statistics
 import subprocess
+import sys
 
 
 def run(program, args, cpu, times):
@@ -41,14 +42,14 @@ def main():
     parser.add_argument("--more", type=int, default=3)
     parser.add_argument("--limit", type=float, default=1.02)
     parser.add_argument("--cpu", type=int, default=1)
-    parser.add_argument("args", nargs="*", help="of both programs")
-    options = parser.parse_args()
+    end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    options, args = parser.parse_args(sys.argv[1:end]), sys.argv[end + 1:] # args: of both programs
     times = {}
-    rounds(options, options.args, times)
+    rounds(options, args, times)
     for _ in range(options.more):
         cases = {key[0] for key, row in times.items() if ratio(options, row) > options.limit and "machine" not in key[0]}
         for case in sorted(cases):
-            rounds(options, options.args + ["--filter", case], times)
+            rounds(options, args + ["--filter", case], times)
     both = sorted(((ratio(options, row), key) for key, row in times.items() if len(row) == 2), reverse=True)
     print("| case | instructions | threads | %s | %s | ratio | rounds |\n|---|---|---|---|---|---|---|" % ("old ms", "new ms"))
     for value, key in both:
