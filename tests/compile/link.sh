@@ -3,16 +3,17 @@
 # private copies (GSFIXER_STATIC) live side by side, every declared function is defined, and what GSF_NO_STB leaves works.
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
-link() { # NAME SOURCE...: compiles by extension, links, runs
+link() { # NAME SOURCE...: compiles by extension, unless that was done before, links, runs
     local name=$1 objects=() source
     shift
     count=$((count + 1))
     for source in "$@"; do
+        objects+=("$work/$source.o")
+        [ ! -e "$work/$source.o" ] || continue
         case $source in
             *.c) "$c_compiler" -std=c11 -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
             *.cpp) "$cxx" -std=c++17 -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
         esac > "$work/log" 2>&1 || { failed "$name ($source)" "$work/log"; return; }
-        objects+=("$work/$source.o")
     done
     "$cxx" "${objects[@]}" -o "$work/program" -lm > "$work/log" 2>&1 || { failed "$name" "$work/log"; return; }
     "$work/program" > "$work/log" 2>&1 || { echo "exit status $?" >> "$work/log"; failed "$name (run)" "$work/log"; }
