@@ -5193,9 +5193,10 @@ static void gsf__quantize_panel(void* arg, size_t panel, int32_t worker) {
             memset(q, 0, (size_t)job->padded * sizeof *q);
         }
         w->scales[row] = scale;
-        for (int64_t k = 0; k < job->padded; k++) {
-            to[(k >> 2) * 64 + c * 4 + (k & 3)] = (int8_t)q[k];
-            sum += q[k];
+        for (int64_t k = 0; k < job->padded; k += 4) {
+            const int8_t four[4] = {(int8_t)q[k], (int8_t)q[k + 1], (int8_t)q[k + 2], (int8_t)q[k + 3]};
+            memcpy(to + 16 * k + 4 * c, four, 4);
+            sum += q[k] + q[k + 1] + q[k + 2] + q[k + 3];
         }
         w->offsets[row] = 128 * sum;
     }
