@@ -1348,9 +1348,9 @@ gsf_result gsfix_fix_scene(gsfix_app* app, const gsfix_setup* setup, const gsfix
 int gsfix_run_fix(gsfix_app* app) {
     gsfix_setup setup;
     int code = gsfix_resolve_setup(app, &setup);
+    if (code == 0 && app->o.video && (!app->o.restorer || strcmp(app->o.restorer, "none") == 0))
+        return gsfix_misused(app, "--video: shows what a --restorer repairs, and there is none (see gsfix render --video)");
     if (code == 0) code = gsfix_check_video(app);
     if (code) return code;
-    if (app->o.video && (!app->o.restorer || strcmp(app->o.restorer, "none") == 0))
-        return gsfix_misused(app, "--video: shows what a --restorer repairs, and there is none (see gsfix render --video)");
     return gsfix_fix_scene(app, &setup, NULL) == GSF_OK ? 0 : gsfix_failed(app);
 }
