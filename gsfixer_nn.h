@@ -3196,11 +3196,11 @@ GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float sca
     const int64_t whole = count / GSF__LANES * GSF__LANES;
     const size_t left = (size_t)(count - whole);
     const gsf__vm first = gsf__vm_first(left);
-    gsf__vf top0 = lowest, top1 = lowest, tail = lowest, last = lowest; // NaNs are ignored
+    gsf__vf top0 = lowest, top1 = lowest, tail = lowest, last = lowest;
     double sum = 0.0;
     if (left) {
         tail = gsf__v_load_first(x + whole, left);
-        top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest);
+        top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest); // NaNs are ignored
     }
     for (int64_t i = 0; i + GSF__LANES < whole; i += 2 * GSF__LANES) {
         top0 = gsf__v_max(factor * gsf__v_load(x + i), top0);
@@ -4849,17 +4849,12 @@ static const gsf__int8_kernels gsf__int8_scalar = {
 #ifdef GSF__KERNELS_INT8
 #if GSF__LANES > 1
 
-GSF__V_INLINE gsf__vf GSF__V(gsf__int8_load)(const float* x, int first) {
-    return first ? gsf__v_hadamard(gsf__v_load(x), GSF__LANES) : gsf__v_load(x);
-}
-
-// Two butterfly steps, of `half` and twice `half`, a multiple of GSF__LANES; `first`: after those within each vector.
-GSF__V_INLINE void GSF__V(gsf__int8_two_steps)(float* x, int64_t block, int64_t half, int first) {
+// Two butterfly steps, of `half` and twice `half`, a multiple of GSF__LANES.
+GSF__V_INLINE void GSF__V(gsf__int8_two_steps)(float* x, int64_t block, int64_t half) {
     for (int64_t i = 0; i < block; i += 4 * half)
         for (int64_t j = i; j < i + half; j += GSF__LANES) {
-            const gsf__vf a = GSF__V(gsf__int8_load)(x + j, first), b = GSF__V(gsf__int8_load)(x + j + half, first);
-            const gsf__vf c = GSF__V(gsf__int8_load)(x + j + 2 * half, first);
-            const gsf__vf d = GSF__V(gsf__int8_load)(x + j + 3 * half, first);
+            const gsf__vf a = gsf__v_load(x + j), b = gsf__v_load(x + j + half);
+            const gsf__vf c = gsf__v_load(x + j + 2 * half), d = gsf__v_load(x + j + 3 * half);
             const gsf__vf ab = a + b, cd = c + d, a_b = a - b, c_d = c - d;
             gsf__v_store(x + j, ab + cd);
             gsf__v_store(x + j + half, a_b + c_d);
@@ -4882,17 +4877,12 @@ GSF__V_KERNEL float GSF__V(gsf__int8_rotate)(float* x, int64_t count, int64_t bl
     for (int64_t i = 0; i < count; i += stride) {
         float* p = x + i;
         int64_t half = GSF__LANES;
-        if (4 * half <= block) {
-            GSF__V(gsf__int8_two_steps)(p, block, half, 1);
-            half *= 4;
-        } else {
-            for (int64_t j = 0; j < block; j += GSF__LANES) {
-                const size_t left = (size_t)(count - i - j);
-                if (block >= GSF__LANES) gsf__v_store(p + j, gsf__v_hadamard(gsf__v_load(p + j), GSF__LANES));
-                else gsf__v_store_first(p + j, gsf__v_hadamard(gsf__v_load_first(p + j, left), block), left);
-            }
+        for (int64_t j = 0; j < block; j += GSF__LANES) {
+            const size_t left = (size_t)(count - i - j);
+            if (block >= GSF__LANES) gsf__v_store(p + j, gsf__v_hadamard(gsf__v_load(p + j), GSF__LANES));
+            else gsf__v_store_first(p + j, gsf__v_hadamard(gsf__v_load_first(p + j, left), block), left);
         }
-        for (; 4 * half <= block; half *= 4) GSF__V(gsf__int8_two_steps)(p, block, half, 0);
+        for (; 4 * half <= block; half *= 4) GSF__V(gsf__int8_two_steps)(p, block, half);
         if (half < block) GSF__V(gsf__int8_one_step)(p, block, half);
     }
     gsf__vi top = gsf__vi_set(0); // bits of magnitudes, see gsf__int8_top

@@ -3,8 +3,8 @@
 
     bench/paired.py OLD/bench_nn NEW/bench_nn [--rounds 6] [--more 3] [--limit 1.02] [--cpu 1] -- --quick --threads 1
 
-Of all rounds the fastest counts. Cases above the limit are repeated up to --more times --rounds rounds, each alone, since
-memory-bound cases need many rounds; what stays above the limit is listed first. Rows named "machine" measure the machine, by the
+Of all rounds the fastest counts. Cases above the limit are repeated, with those whose names begin with the same two words, up to
+--more times --rounds rounds, since memory-bound cases need many rounds; what stays above the limit is listed first. Rows named "machine" measure the machine, by the
 same code in both builds, and show how far the ratios can be trusted.
 """
 import argparse
@@ -47,9 +47,10 @@ def main():
     times = {}
     rounds(options, args, times)
     for _ in range(options.more):
-        cases = {key[0] for key, row in times.items() if ratio(options, row) > options.limit and "machine" not in key[0]}
-        for case in sorted(cases):
-            rounds(options, args + ["--filter", case], times)
+        groups = {" ".join(key[0].split()[:2]) for key, row in times.items()
+                  if ratio(options, row) > options.limit and "machine" not in key[0]}
+        for group in sorted(groups): # the programs filter groups of cases, whose names begin alike
+            rounds(options, args + ["--filter", group], times)
     both = sorted(((ratio(options, row), key) for key, row in times.items() if len(row) == 2), reverse=True)
     print("| case | instructions | threads | %s | %s | ratio | rounds |\n|---|---|---|---|---|---|---|" % ("old ms", "new ms"))
     for value, key in both:
