@@ -4877,11 +4877,13 @@ GSF__V_KERNEL float GSF__V(gsf__int8_rotate)(float* x, int64_t count, int64_t bl
     for (int64_t i = 0; i < count; i += stride) {
         float* p = x + i;
         int64_t half = GSF__LANES;
-        for (int64_t j = 0; j < block; j += GSF__LANES) {
-            const size_t left = (size_t)(count - i - j);
-            if (block >= GSF__LANES) gsf__v_store(p + j, gsf__v_hadamard(gsf__v_load(p + j), GSF__LANES));
-            else gsf__v_store_first(p + j, gsf__v_hadamard(gsf__v_load_first(p + j, left), block), left);
+        if (block < GSF__LANES) {
+            const size_t left = (size_t)(count - i);
+            gsf__v_store_first(p, gsf__v_hadamard(gsf__v_load_first(p, left), block), left);
+            continue;
         }
+        for (int64_t j = 0; j < block; j += GSF__LANES)
+            gsf__v_store(p + j, gsf__v_hadamard(gsf__v_load(p + j), GSF__LANES));
         for (; 4 * half <= block; half *= 4) GSF__V(gsf__int8_two_steps)(p, block, half);
         if (half < block) GSF__V(gsf__int8_one_step)(p, block, half);
     }
