@@ -28,6 +28,7 @@
        GSF_USE_GLM             C++ only: adapters to glm matrices (define it before every include)
        GSF_ASSERT(x)           default assert(x); used only to detect bugs of this library
        GSF_NO_SIMD             scalar kernels only
+       GSF_NO_AVX512           no AVX-512: a tenth smaller, faster to compile
 
    STEP BY STEP
        gsf_context ctx;
@@ -677,6 +678,11 @@ __asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
 #define GSF__INLINE_VNNI GSF__TARGET_VNNI GSF__ALWAYS_INLINE static inline
 #define GSF__TARGET_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16")))
 #define GSF__INLINE_BF16 GSF__TARGET_BF16 GSF__ALWAYS_INLINE static inline
+#ifdef GSF_NO_AVX512 // nothing refers to the kernels, so that compilers drop them
+#define GSF__REACHES(level, wanted) 0
+#else
+#define GSF__REACHES(level, wanted) ((level) >= GSF_CPU_##wanted) // for AVX512, AVX512_VNNI, AVX512_BF16
+#endif
 #else
 #define GSF__X86 0
 #endif
@@ -1762,7 +1768,7 @@ GSF__SHARED float gsf__exp2_f32(float x) {
 #if GSF__X86
 #define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__WIDE_KERNEL_OF(level, name) \
-    ((level) >= GSF_CPU_AVX512 ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
+    (GSF__REACHES(level, AVX512) ? name##_avx512 : (level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
 #define GSF__LANE_KERNEL_OF GSF__KERNEL_OF
 #define GSF__ANY_KERNEL_OF GSF__WIDE_KERNEL_OF
 #elif GSF__SIMD128
@@ -2662,6 +2668,7 @@ static gsf_cpu_level gsf__detect_cpu_level(void) {
     const uint64_t saved = gsf__saved_state();
     if ((saved & ymm) != ymm) return GSF_CPU_SCALAR;
     if ((saved & zmm) != zmm || (seven[1] & (f_dq | bw_vl)) != (f_dq | bw_vl)) return GSF_CPU_AVX2;
+    if (!GSF__REACHES(GSF_CPU_AVX512, AVX512)) return GSF_CPU_AVX2;
     if (!(seven[2] & vnni)) return GSF_CPU_AVX512;
     return more[0] & bf16 ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
 #else

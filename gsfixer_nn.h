@@ -3236,7 +3236,7 @@ static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level l
 #if GSF__X86
     static const gsf__activation_kernels avx2 = {gsf__activate_avx2, gsf__softmax_avx2};
     static const gsf__activation_kernels avx512 = {gsf__activate_avx512, gsf__softmax_avx512};
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -3613,7 +3613,7 @@ static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
                                            gsf__norm_affine_avx2};
     static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
                                              gsf__norm_affine_avx512};
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -4484,8 +4484,8 @@ static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf
 
 static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, int pairs) { // pairs: prefer bf16
 #if GSF__X86
-    if (level >= GSF_CPU_AVX512_BF16 && pairs) return &gsf__linear_bf16;
-    if (level >= GSF_CPU_AVX512) return &gsf__linear_avx512;
+    if (GSF__REACHES(level, AVX512_BF16) && pairs) return &gsf__linear_bf16;
+    if (GSF__REACHES(level, AVX512)) return &gsf__linear_avx512;
     if (level >= GSF_CPU_AVX2) return &gsf__linear_avx2;
 #endif
     (void)level;
@@ -5137,7 +5137,7 @@ static const gsf__int8_kernels gsf__int8_vnni = {
 
 static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
-    if (level >= GSF_CPU_AVX512_VNNI) return &gsf__int8_vnni;
+    if (GSF__REACHES(level, AVX512_VNNI)) return &gsf__int8_vnni;
     if (level >= GSF_CPU_AVX2) return &gsf__int8_avx2;
 #endif
     (void)level;
@@ -6011,8 +6011,8 @@ static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, 
     static const gsf__attention_parts bf16 = {
         2, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
         gsf__attention_logits_bf16, gsf__attention_weights_bf16, gsf__attention_values_bf16};
-    if (level >= GSF_CPU_AVX512_BF16 && pairs) return &bf16;
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512_BF16) && pairs) return &bf16;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)pairs;
@@ -6266,7 +6266,7 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
     static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, NULL, gsf__conv_store_avx2, gsf__norm_silu_avx2};
     static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_two_avx512, gsf__conv_store_avx2,
                                              gsf__norm_silu_avx512};
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -16966,7 +16966,7 @@ static const gsf__map_kernels* gsf__map_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
     GSF_X(avx2);
     GSF_X(avx512);
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
 #undef GSF_X
@@ -18515,7 +18515,7 @@ static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
         gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__add_product_avx512, gsf__gather_row_avx512,
         gsf__rope_grad_avx512, gsf__channel_sums_avx512, gsf__channel_grad_avx512, gsf__adam_avx512,
         gsf__attention_grad_row_avx512};
-    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;

@@ -52,6 +52,7 @@ done <<< "$orders"
 whole() { echo "#define GSFIXER_IMPLEMENTATION"; include_all "${headers[@]}"; }
 whole | unit "NDEBUG" -DNDEBUG
 whole | unit "GSF_NO_SIMD" -DGSF_NO_SIMD
+whole | unit "GSF_NO_AVX512" -DGSF_NO_AVX512
 whole | unit "GSF_NO_STB" -DGSF_NO_STB
 whole | unit "GSFIXER_STATIC" -DGSFIXER_STATIC
 whole | unit "GSF_NN_TRAINING" -DGSF_NN_TRAINING
