@@ -4,8 +4,8 @@
     bench/paired.py OLD/bench_nn NEW/bench_nn [--rounds 6] [--more 3] [--limit 1.02] [--cpu 1] -- --quick --threads 1
 
 Of all rounds the fastest counts. Cases above the limit are repeated, with those whose names begin with the same two words, up to
---more times --rounds rounds, since memory-bound cases need many rounds; what stays above the limit is listed first. Rows named "machine" measure the machine, by the
-same code in both builds, and show how far the ratios can be trusted.
+--more times --rounds rounds, since memory-bound cases need many rounds; what stays above the limit is listed first. Rows named
+"machine" measure the machine, by the same code in both builds, and show how far the ratios can be trusted.
 """
 import argparse
 import json
