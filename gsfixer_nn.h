@@ -6125,20 +6125,23 @@ typedef struct gsf__conv_kernels {
     void (*norm_silu)(const float* x, int64_t count, const float* mean, const float* scale, const float* offset, float* y);
 } gsf__conv_kernels;
 
+// Two pixels by four outputs: eight sums, so that an addition need not wait for the one before.
 static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c,
                                    const float* ahead) {
     (void)ahead;
-    for (int64_t m = 0; m < count; m++)
-        for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
-            const float* w = b + n0;
-            float* y = c + m * GSF__CONV_N + n0;
-            float y0 = 0.0f, y1 = 0.0f, y2 = 0.0f, y3 = 0.0f;
+    for (int64_t m = 0; m < count; m += 2, c += 2 * GSF__CONV_N) {
+        const float *a0 = a + m * lda, *a1 = m + 1 < count ? a0 + lda : a0;
+        for (int n = 0; n < GSF__CONV_N; n += 4) {
+            const float* w = b + n;
+            float y[4] = {0.0f, 0.0f, 0.0f, 0.0f}, z[4] = {0.0f, 0.0f, 0.0f, 0.0f};
             for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
-                const float x = a[m * lda + i];
-                y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
+                const float x0 = a0[i], x1 = a1[i];
+                y[0] += x0 * w[0], y[1] += x0 * w[1], y[2] += x0 * w[2], y[3] += x0 * w[3];
+                z[0] += x1 * w[0], z[1] += x1 * w[1], z[2] += x1 * w[2], z[3] += x1 * w[3];
             }
-            y[0] += y0, y[1] += y1, y[2] += y2, y[3] += y3;
+            for (int i = 0; i < 4; i++) c[n + i] += y[i], c[GSF__CONV_N + n + i] += z[i];
         }
+    }
 }
 
 static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo,
