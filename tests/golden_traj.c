@@ -62,7 +62,7 @@ static void compare_poses(const char* name, const double* actual, const double* 
     double* expected = poses_of(t, &n);
     double* ours = (double*)take(n * 16 * sizeof(double));
     for (size_t i = 0; i < 16 * n; i++) ours[i] = actual[i] * (signs && i % 4 < 3 ? signs[i % 4] : 1.0);
-    char what[1200];
+    char what[2400];
     snprintf(what, sizeof what, "%s: %s", file.path, name);
     test_compare(what, ours, expected, 16 * n, tol * test_max_abs(expected, 16 * n));
     free(expected);
@@ -71,7 +71,7 @@ static void compare_poses(const char* name, const double* actual, const double* 
 
 static void compare_values(const char* name, const double* actual, size_t count, double tol) {
     const test_tensor* t = get(name);
-    char what[1200];
+    char what[2400];
     snprintf(what, sizeof what, "%s: %s", file.path, name);
     if (CHECK(t->count == count)) test_compare(what, actual, t->v, count, tol * test_max_abs(t->v, count));
 }

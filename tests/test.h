@@ -128,7 +128,16 @@ static inline test_names test_list_golden(const char* folder, const char* prefix
     return names;
 }
 
-// Path of a scratch file of this test program (its own folder in the build tree); static buffers as above.
+// A program that holds several tests runs the one by whose name it is called: without folder and ending.
+static char test_called[64];
+static inline const char* test_name(const char* program) {
+    for (const char* c = program; *c; c++)
+        if (*c == '/' || *c == '\\') program = c + 1;
+    snprintf(test_called, sizeof test_called, "%.*s", (int)strcspn(program, "."), program);
+    return test_called;
+}
+
+// Path of a scratch file of this test (its own folder in the build tree); static buffers as above.
 static inline const char* test_scratch(const char* name) {
     static char paths[8][1024];
     static int turn;
@@ -139,7 +148,7 @@ static inline const char* test_scratch(const char* name) {
     if (!root || !*root) root = "/tmp";
 #endif
     char* path = paths[turn++ & 7];
-    snprintf(path, sizeof paths[0], "%s/%s", root, name);
+    snprintf(path, sizeof paths[0], "%s/%s%s%s", root, test_called, test_called[0] ? "/" : "", name);
     return path;
 }
 
@@ -178,7 +187,7 @@ static inline char* test_read_file(const char* path, size_t* size) { // exits wh
     return data;
 }
 
-typedef struct test_tensors { char* data; size_t size; char path[1024]; } test_tensors; // a safetensors file
+typedef struct test_tensors { char* data; size_t size; char path[2048]; } test_tensors; // a safetensors file
 
 typedef struct test_tensor { // values widened to double; NULL when absent
     double* v;

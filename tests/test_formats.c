@@ -30,12 +30,6 @@ static gsf_context make_context(counter* c, int odd) {
     return ctx;
 }
 
-static unsigned char* exact_copy(const void* data, size_t size) { // so that ASan detects a read past the end
-    unsigned char* p = (unsigned char*)malloc(size ? size : 1);
-    if (size) memcpy(p, data, size);
-    return p;
-}
-
 static int is_refusal(gsf_result r) {
     return r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED || r == GSF_ERROR_NUMERIC;
 }
@@ -254,11 +248,11 @@ static void test_official_4(void) {
         gsf_splat_destroy(&ctx, &official);
     }
     for (size_t at = 0; at < size; at += at < 200 ? 1 : 29) {
-        unsigned char* part = exact_copy(file, at);
+        unsigned char* part = (unsigned char*)exact_copy(file, at);
         CHECK(is_refusal(gsf_splat_parse(&ctx, "cut.spz", part, at, &official)) && !official.owned);
         free(part);
         for (int flip = 1; flip < 256; flip += 17) {
-            unsigned char* whole = exact_copy(file, size);
+            unsigned char* whole = (unsigned char*)exact_copy(file, size);
             whole[at] ^= (unsigned char)flip;
             const gsf_result r = gsf_splat_parse(&ctx, "flip.spz", whole, size, &official);
             CHECK(r == GSF_OK || (is_refusal(r) && !official.owned));
@@ -425,7 +419,7 @@ static void test_workers(void) {
 
 // ---- out of range ---------------------------------------------------------
 
-static void test_not_finite(void) {
+static void test_format_not_finite(void) {
     static const float evil[3] = {NAN, INFINITY, -INFINITY};
     static const char* const names[3] = {"x.splat", "x.spz", "x.glb"};
     for (int attribute = 0; attribute < 5; attribute++)
@@ -607,12 +601,12 @@ static void test_damage(void) {
     memset(&text, 0, sizeof text);
     CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.spz", &s, NULL, &text));
     for (size_t cut = 0; cut < text.size; cut++) {
-        unsigned char* part = exact_copy(text.data, cut);
+        unsigned char* part = (unsigned char*)exact_copy(text.data, cut);
         parse_damaged(&ctx, "cut.spz", part, cut, 0);
         free(part);
     }
     // An accepted flip must not change the splats: gzip's time and hints, bits after the last block, an equivalent distance.
-    unsigned char* whole = exact_copy(text.data, text.size);
+    unsigned char* whole = (unsigned char*)exact_copy(text.data, text.size);
     gsf_splats sound, damaged;
     size_t passed = 0;
     CHECK_OK(&ctx, gsf_splat_parse(&ctx, "x.spz", whole, text.size, &sound));
@@ -645,7 +639,7 @@ static void test_damage(void) {
                 memcpy(content, spz_by_hand[version - 1], size);
                 content[at] ^= (unsigned char)flip;
                 unsigned char* file = wrap(content, size, &file_size);
-                unsigned char* exact = exact_copy(file, file_size);
+                unsigned char* exact = (unsigned char*)exact_copy(file, file_size);
                 count.asked = 0;
                 // fractional bits, flags other than "extensions", the reserved byte, and all values
                 parse_damaged(&ctx, "head.spz", exact, file_size, at >= 13 || (version == 2 && at == 12));
@@ -663,7 +657,7 @@ static void test_damage(void) {
     gsf_destroy_buffer(&ctx, &text);
     CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.splat", &s, NULL, &text));
     for (size_t cut = 0; cut < text.size; cut++) {
-        unsigned char* part = exact_copy(text.data, cut);
+        unsigned char* part = (unsigned char*)exact_copy(text.data, cut);
         parse_damaged(&ctx, "cut.splat", part, cut, cut % 32 == 0);
         free(part);
     }
@@ -984,14 +978,14 @@ static void test_glb_damage(void) { // cut anywhere; any byte of header and JSON
     glb_arrays(arrays);
     unsigned char* file = glb_of(GLB_NODES GLB_TREE GLB_REST, arrays, sizeof arrays, &size);
     for (size_t cut = 0; cut < size; cut++) {
-        unsigned char* part = exact_copy(file, cut);
+        unsigned char* part = (unsigned char*)exact_copy(file, cut);
         parse_damaged(&ctx, "cut.glb", part, cut, 0);
         free(part);
     }
     for (size_t at = 0; at < size; at++)
         for (int flip = 1; flip < 256; flip += at < 20 ? 1 : 37) {
             file[at] ^= (unsigned char)flip;
-            unsigned char* whole = exact_copy(file, size);
+            unsigned char* whole = (unsigned char*)exact_copy(file, size);
             parse_damaged(&ctx, "flip.glb", whole, size, 1);
             free(whole);
             file[at] ^= (unsigned char)flip;
@@ -1008,7 +1002,7 @@ int main(void) {
     test_round_trips();
     test_background();
     test_workers();
-    test_not_finite();
+    test_format_not_finite();
     test_extent();
     test_types();
     test_damage();

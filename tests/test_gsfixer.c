@@ -164,7 +164,7 @@ static gsf_camera plain_camera(void) {
     return camera;
 }
 
-static void test_out_of_memory(void) {
+static void test_base_out_of_memory(void) {
     gsf_context ctx;
     heap h;
     init_with_heap(&ctx, &h);
@@ -1020,7 +1020,7 @@ static void test_random_statistics(void) {
 
 // ---- cameras -------------------------------------------------------------------
 
-static gsf_camera random_camera(uint64_t* seed) {
+static gsf_camera any_camera(uint64_t* seed) {
     double q[4], norm = 0.0;
     for (int k = 0; k < 4; k++) {
         q[k] = test_random_in(seed, -1, 1);
@@ -1043,7 +1043,7 @@ static gsf_camera random_camera(uint64_t* seed) {
 static void test_camera_functions(gsf_context* ctx) {
     uint64_t seed = 4;
     for (int i = 0; i < 100; i++) {
-        const gsf_camera camera = random_camera(&seed);
+        const gsf_camera camera = any_camera(&seed);
         CHECK_OK(ctx, gsf_check_camera(ctx, &camera));
         double c2w[16], identity[16], unit[16] = {0}, center[3];
         gsf_get_camera_c2w(&camera, c2w);
@@ -1092,7 +1092,7 @@ static void test_camera_files(gsf_context* ctx) {
     const char* names[COUNT];
     uint64_t seed = 8;
     for (int i = 0; i < COUNT; i++) {
-        cameras[i] = random_camera(&seed);
+        cameras[i] = any_camera(&seed);
         names[i] = i % 3 ? "na\"me \xc3\xa9.png" : NULL;
     }
     size_t count = 0;
@@ -1143,7 +1143,7 @@ int main(void) {
     heap h;
     init_with_heap(&ctx, &h);
     test_hooks();
-    test_out_of_memory();
+    test_base_out_of_memory();
     test_damaged_chunks(&ctx);
     test_json_conformance(&ctx);
     test_json_values(&ctx);

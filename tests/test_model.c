@@ -3,9 +3,11 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
+#pragma push_macro("main")
+#undef main
 #define main make_model_main
 #include "../bench/make_model.c"
-#undef main
+#pragma pop_macro("main")
 
 #include "test.h"
 #include "test_hooks.h"
@@ -100,7 +102,7 @@ static void check_same_parts(const folder* a, const folder* b) {
     CHECK(same_file(a, b, "model_index.json"));
 }
 
-static void check_same(gsf_context* ctx) {
+static void check_same_model(gsf_context* ctx) {
     static const char* const sharded_parts[] = {"transformer", "text_encoder", "blip2"};
     const folder first = scratch("first"), again = scratch("again"), other = scratch("other"), sharded = scratch("sharded");
     const folder wide = scratch("wide");
@@ -229,7 +231,7 @@ static float* made_noise(uint64_t seed, size_t count) {
 }
 
 static int gates; // gate tensors seen
-static void see_tap(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
+static void see_block(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
     (void)user;
     (void)row;
     const char* part = strchr(name, '.');
@@ -242,7 +244,7 @@ static void see_tap(void* user, const char* name, int32_t row, const float* data
     }
 }
 
-static void check_transformer(gsf_context* ctx, const folder* model) {
+static void check_made_transformer(gsf_context* ctx, const folder* model) {
     gsf_nn_transformer net;
     gsf_nn_weights features;
     if (!CHECK_OK(ctx, gsf_nn_load_transformer(ctx, inside(model, "transformer"), &net))) return;
@@ -276,7 +278,7 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
         in.timesteps = steps;
         in.references = references;
         in.reference_tokens = tokens;
-        const gsf__nn_tap tap = {see_tap, NULL};
+        const gsf__nn_tap tap = {see_block, NULL};
         in._tap = &tap;
         CHECK_OK(ctx, gsf_nn_run_transformer(ctx, &net, &in, out));
         check_rms("velocity", out, plane * (size_t)net.out_channels, 0.5, 2.0);
@@ -292,7 +294,7 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
     gsf_nn_destroy_transformer(ctx, &net);
 }
 
-static void check_vae(gsf_context* ctx, const folder* model) {
+static void check_made_vae(gsf_context* ctx, const folder* model) {
     gsf_nn_vae vae;
     gsf_nn_vae_info info, back;
     const int64_t frames = 9, height = 48, width = 40;
@@ -314,7 +316,7 @@ static void check_vae(gsf_context* ctx, const folder* model) {
 }
 
 // The output of an encoder is not constant: its rows differ from each other.
-static void check_rows(const char* what, const float* x, int64_t rows, int64_t columns) {
+static void check_made_rows(const char* what, const float* x, int64_t rows, int64_t columns) {
     double change = 0.0;
     check_rms(what, x, (size_t)(rows * columns), 0.5, 3.0);
     for (int64_t i = columns; i < rows * columns; i++) change += fabs((double)x[i] - (double)x[i - columns]);
@@ -337,7 +339,7 @@ static void check_images(gsf_context* ctx, const folder* model) {
         float* out = (float*)malloc((size_t)(IMAGES * TOKENS * dinov2.width) * sizeof(float));
         CHECK(dinov2.width == 1024 && dinov2.layers == 1);
         CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, &dinov2, &in, out));
-        check_rows("dinov2", out, IMAGES * TOKENS, dinov2.width);
+        check_made_rows("dinov2", out, IMAGES * TOKENS, dinov2.width);
         gsf_nn_destroy_dinov2(ctx, &dinov2);
         free(out);
     }
@@ -345,7 +347,7 @@ static void check_images(gsf_context* ctx, const folder* model) {
         float* out = (float*)malloc((size_t)(IMAGES * TOKENS * 2 * vggt.width) * sizeof(float));
         CHECK(vggt.width == 1024 && vggt.layers == 1);
         CHECK_OK(ctx, gsf_nn_encode_vggt(ctx, &vggt, &in, out));
-        check_rows("vggt", out, IMAGES * TOKENS, 2 * vggt.width);
+        check_made_rows("vggt", out, IMAGES * TOKENS, 2 * vggt.width);
         gsf_nn_destroy_vggt(ctx, &vggt);
         free(out);
     }
@@ -380,7 +382,7 @@ static void check_text(gsf_context* ctx, const folder* model) {
         float* out = (float*)malloc(count * (size_t)t5.width * sizeof(float));
         CHECK(tokenizer.id_count <= t5.vocabulary);
         CHECK_OK(ctx, gsf_nn_encode_t5(ctx, &t5, &in, out));
-        check_rows("text", out, (int64_t)count, t5.width);
+        check_made_rows("text", out, (int64_t)count, t5.width);
         gsf_nn_destroy_t5(ctx, &t5);
         free(out);
     }
@@ -416,8 +418,8 @@ static void check_runs(gsf_context* ctx) {
     gsf_nn_dit_desc desc;
     gsf_restorer restorer;
     char path[2][1100];
-    check_transformer(ctx, &model);
-    check_vae(ctx, &model);
+    check_made_transformer(ctx, &model);
+    check_made_vae(ctx, &model);
     check_images(ctx, &model);
     check_text(ctx, &model);
     check_captions(ctx, &model);
@@ -475,7 +477,7 @@ static void check_errors(gsf_context* ctx) {
 int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
-    check_same(&ctx);
+    check_same_model(&ctx);
     check_full(&ctx);
     check_golden(&ctx);
     check_runs(&ctx);

@@ -396,7 +396,7 @@ static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, cons
 
 typedef struct seen { uint64_t sum; int stages; } seen; // checksum of the bits of all intermediates
 
-static void see_tap(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns) {
+static void sum_tap(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns) {
     seen* s = (seen*)user;
     (void)name;
     (void)index;
@@ -441,7 +441,7 @@ static void test_runs(const gsf_image* photo) {
         memset(&d, 0, sizeof d);
         d.image = photo;
         d.max_new_tokens = 3;
-        const gsf__nn_tap tap = {see_tap, &sums[k]};
+        const gsf__nn_tap tap = {sum_tap, &sums[k]};
         d._tap = &tap;
         CHECK_OK(&ctx, gsf__nn_caption_ids(&ctx, &net, &d, &ids, &count));
         for (size_t i = 0; i < count; i++) sums[k].sum = (sums[k].sum ^ (uint64_t)ids[i]) * 0x100000001b3u;

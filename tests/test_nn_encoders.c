@@ -6,9 +6,9 @@
 #include "test.h"
 #include "test_hooks.h"
 
-enum { HEIGHT = 28, WIDTH = 42, IMAGES = 3, ROOM = 1 << 20 };
+enum { IMAGE_HEIGHT = 28, IMAGE_WIDTH = 42, IMAGES = 3, ROOM = 1 << 20 };
 
-static float pixels[IMAGES * 3 * HEIGHT * WIDTH];
+static float pixels[IMAGES * 3 * IMAGE_HEIGHT * IMAGE_WIDTH];
 
 typedef struct edit { // changes to a model's files; NULL: unchanged
     const char *drop, *widen, *add, *poison; // tensors to remove, to give an extra dimension, to add, to put a NaN into
@@ -69,8 +69,8 @@ static gsf_nn_encoder_desc small_input(void) {
     memset(&in, 0, sizeof in);
     in.pixels = pixels;
     in.images = IMAGES;
-    in.height = HEIGHT;
-    in.width = WIDTH;
+    in.height = IMAGE_HEIGHT;
+    in.width = IMAGE_WIDTH;
     return in;
 }
 
@@ -132,7 +132,7 @@ static void test_vggt_alone(gsf_context* ctx, const float* expected, float* out)
     for (int file = 0; file < 2; file++) {
         gsf_nn_vggt net;
         if (!CHECK_OK(ctx, gsf_nn_load_vggt(ctx, test_scratch(file ? "model.safetensors" : "."), &net))) return;
-        const size_t count = (size_t)(IMAGES * (HEIGHT / net.patch) * (WIDTH / net.patch) * 2 * net.width);
+        const size_t count = (size_t)(IMAGES * (IMAGE_HEIGHT / net.patch) * (IMAGE_WIDTH / net.patch) * 2 * net.width);
         CHECK(net.layers > 0 && net.embed_layers > 0 && net.rope_base == 100.0 && net.width % net.heads == 0);
         CHECK_OK(ctx, gsf_nn_encode_vggt(ctx, &net, &in, out));
         CHECK(memcmp(out, expected, count * sizeof(float)) == 0);
@@ -171,7 +171,7 @@ static void test_poison(gsf_context* ctx, float* out) {
 // ---- inputs ----------------------------------------------------------------------
 
 static void test_bad_inputs(gsf_context* ctx, const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, float* out) {
-    static float nan_pixels[3 * HEIGHT * WIDTH];
+    static float nan_pixels[3 * IMAGE_HEIGHT * IMAGE_WIDTH];
     for (int kind = 0; kind < 2; kind++)
         for (int i = 0; i < 7; i++) {
             gsf_nn_encoder_desc in = small_input();
@@ -233,13 +233,13 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
 static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out) {
     enum { MANY = 420 };
     gsf_nn_encoder_desc in = small_input();
-    const size_t image = (size_t)(3 * HEIGHT * WIDTH), count = (size_t)(6 * dino->width);
+    const size_t image = (size_t)(3 * IMAGE_HEIGHT * IMAGE_WIDTH), count = (size_t)(6 * dino->width);
     float *many = (float*)malloc(MANY * image * sizeof(float)), *whole = (float*)malloc(MANY * count * sizeof(float));
     for (size_t i = 0; i < MANY; i++)
         for (size_t k = 0; k < image; k++) many[i * image + k] = pixels[i % IMAGES * image + k] * (float)(i + 1) / MANY;
     in.images = MANY;
     in.pixels = many;
-    CHECK(HEIGHT / dino->patch * (WIDTH / dino->patch) == 6);
+    CHECK(IMAGE_HEIGHT / dino->patch * (IMAGE_WIDTH / dino->patch) == 6);
     CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, dino, &in, whole));
     in.images = 1;
     for (size_t i = 0; i < MANY; i += i < 3 || i > MANY - 5 ? 1 : 40) {
@@ -254,7 +254,7 @@ static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out)
 }
 
 // Each allocation fails once. The bytes counted are those that the cost query reports plus the kernels' scratch memory.
-static void test_memory(float* out) {
+static void test_encoder_memory(float* out) {
     const gsf_nn_encoder_desc in = small_input();
     gsf_context ctx;
     counter count;
@@ -377,7 +377,7 @@ int main(void) {
     test_cancel(&ctx, &vggt, out);
     test_bad_inputs(&ctx, &dino, &vggt, out);
     test_features(&ctx, &dino, &vggt);
-    test_memory(out);
+    test_encoder_memory(out);
     test_bad_dinov2(&ctx);
     test_bad_vggt(&ctx);
     test_poison(&ctx, out);

@@ -558,7 +558,7 @@ static void test_folders(gsf_context* ctx) { // without a prefix
 
 // ---- memory failures
 
-static void test_memory(gsf_context* plain) {
+static void test_file_memory(gsf_context* plain) {
     gsf_nn_tensor tensors[ALL];
     made m = make_file("{\"a\":{\"dtype\":\"U8\",\"shape\":[3],\"data_offsets\":[0,3]}}", 3);
     make_tensors(tensors);
@@ -778,7 +778,7 @@ int main(void) {
     test_shards(&ctx);
     test_folders(&ctx);
     test_pth(&ctx);
-    test_memory(&ctx);
+    test_file_memory(&ctx);
     test_large_header(&ctx);
     test_golden_model(&ctx, "transformer", "diffusion_pytorch_model", 1);
     test_golden_model(&ctx, "vae", "diffusion_pytorch_model", 1);

@@ -9,7 +9,7 @@
 #include "activation.h"
 
 static gsf_context one, three; // one worker; three workers that run chunks in shuffled order
-static uint64_t seed = 5;
+static uint64_t kernel_seed = 5;
 
 static int open_contexts(gsf_cpu_level level) { // 0: the machine lacks the level
     test_context_zero(&one);
@@ -24,7 +24,7 @@ static int open_contexts(gsf_cpu_level level) { // 0: the machine lacks the leve
 
 static float* make_floats(size_t count, double lo, double hi) {
     float* v = (float*)malloc((count ? count : 1) * sizeof(float));
-    for (size_t i = 0; i < count; i++) v[i] = (float)test_random_in(&seed, lo, hi);
+    for (size_t i = 0; i < count; i++) v[i] = (float)test_random_in(&kernel_seed, lo, hi);
     return v;
 }
 
@@ -327,7 +327,7 @@ static attention_data make_attention(const attention_case* c) {
     if (c->masked) {
         const size_t n = (size_t)(c->heads * c->queries * c->keys);
         a.mask = (unsigned char*)malloc(n);
-        for (size_t i = 0; i < n; i++) a.mask[i] = test_random(&seed) < 0.4;
+        for (size_t i = 0; i < n; i++) a.mask[i] = test_random(&kernel_seed) < 0.4;
         for (int64_t j = 0; j < c->keys; j++) a.mask[j] = 0; // the first query has all keys masked
         for (int64_t j = 0; j < c->keys; j++) a.mask[(c->queries - 1) * c->keys + j] = j == c->keys - 1;
     }

@@ -11,7 +11,7 @@
 enum { BATCH = 2, REFERENCES = 2, WIDTH = 32, HEIGHT = 16, PIXELS = WIDTH * HEIGHT, CANDIDATES = 2 + 3 * REFERENCES };
 enum { FRAME_VALUES = PIXELS * GSF__MINI_FRAME, SHOWN_VALUES = REFERENCES * PIXELS * GSF__MINI_REFERENCE };
 
-static uint64_t seed = 1;
+static uint64_t mini_seed = 1;
 
 // ---- the network in double -------------------------------------------------------
 
@@ -168,14 +168,14 @@ static float planes[BATCH * (FRAME_VALUES + SHOWN_VALUES)];
 static void make_inputs(gsf__mini_input* in, int batch, int width, int height, int references, float* memory) {
     for (int b = 0; b < batch; b++) {
         float *frame = memory, *shown = memory + width * height * GSF__MINI_FRAME;
-        for (int i = 0; i < width * height * GSF__MINI_FRAME; i++) frame[i] = (float)test_random(&seed);
+        for (int i = 0; i < width * height * GSF__MINI_FRAME; i++) frame[i] = (float)test_random(&mini_seed);
         for (int i = 0; i < references * width * height; i++) {
             float* p = shown + i * GSF__MINI_REFERENCE;
             const int seen = i % width > 8, valid = i / width % height < height - 4; // some of both, and neither
             for (int k = 0; k < GSF__MINI_REFERENCE; k++)
-                p[k] = (float)test_random_in(&seed, k == 3 || k == 7 ? -1.0 : 0.1, 1.0);
-            if (!seen || test_random(&seed) < 0.1) p[6] = 0.0f;
-            p[12] = valid && test_random(&seed) < 0.8 ? 1.0f : 0.0f;
+                p[k] = (float)test_random_in(&mini_seed, k == 3 || k == 7 ? -1.0 : 0.1, 1.0);
+            if (!seen || test_random(&mini_seed) < 0.1) p[6] = 0.0f;
+            p[12] = valid && test_random(&mini_seed) < 0.8 ? 1.0f : 0.0f;
         }
         in[b].width = width;
         in[b].height = height;
@@ -202,7 +202,7 @@ static gsf__mini tiny(void) {
 
 static const char* made_path(void) {
     static char path[1200];
-    snprintf(path, sizeof path, "%s/mini.safetensors", TEST_TMP);
+    snprintf(path, sizeof path, "%s", test_scratch("mini.safetensors"));
     return path;
 }
 
@@ -225,7 +225,7 @@ static void test_gradients(gsf_context* ctx) {
     gsf__nn_params params;
     gsf__mini_run run;
     gsf__mini_input in[BATCH];
-    seed = 10; // no unit and no gate is as near to its kink as the differences step
+    mini_seed = 10; // no unit and no gate is as near to its kink as the differences step
     make_inputs(in, BATCH, WIDTH, HEIGHT, REFERENCES, planes);
     CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 1, made_path()));
     if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
@@ -234,9 +234,10 @@ static void test_gradients(gsf_context* ctx) {
     const gsf_nn_tensor* bias = gsf_nn_find_tensor(&net.weights, "head.bias");
     for (int64_t i = 6; i < bias->count; i += GSF__MINI_HEAD) // gates between open and closed, and some of both
         params.value[params.at[bias - net.weights.tensors] + i] = gsf__mini_kept + 0.1f;
-    for (int64_t i = 0; i < params.count; i++) values[i] = (double)(params.value[i] += (float)test_random_in(&seed, -0.3, 0.3));
-    for (int i = 0; i < RESULT; i++) dout[i] = (float)test_random_in(&seed, -1.0, 1.0);
-    for (int i = 0; i < MISTAKE; i++) derror[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    for (int64_t i = 0; i < params.count; i++)
+        values[i] = (double)(params.value[i] += (float)test_random_in(&mini_seed, -0.3, 0.3));
+    for (int i = 0; i < RESULT; i++) dout[i] = (float)test_random_in(&mini_seed, -1.0, 1.0);
+    for (int i = 0; i < MISTAKE; i++) derror[i] = (float)test_random_in(&mini_seed, -1.0, 1.0);
     const twin t = {&net, &params, values};
     for (int b = 0; b < BATCH; b++) run_twin(&t, &in[b], out[0] + 3 * PIXELS * b, error[0] + 2 * PIXELS * b);
     CHECK_OK(ctx, gsf__mini_begin(ctx, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 0, &run)); // results without training
@@ -333,7 +334,7 @@ static void test_loss(gsf_context* ctx) {
     gsf__mini_input in[BATCH];
     gsf__mini_loss loss;
     make_inputs(in, BATCH, WIDTH, HEIGHT, REFERENCES, planes);
-    for (size_t i = 0; i < GSF__COUNT(truth); i++) truth[i] = (float)test_random(&seed);
+    for (size_t i = 0; i < GSF__COUNT(truth); i++) truth[i] = (float)test_random(&mini_seed);
     CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 1, made_path()));
     if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
     CHECK_OK(ctx, gsf__mini_begin(ctx, &net, BATCH, REFERENCES, WIDTH, HEIGHT, 1, &run));
@@ -341,7 +342,7 @@ static void test_loss(gsf_context* ctx) {
     CHECK_OK(ctx, gsf__mini_measure_loss(&run, truth, &loss));
     CHECK_NEAR(loss.total, loss_of(&run, in, truth, 0, 0, 0.0), 1e-9);
     for (int k = 0; k < 40; k++) {
-        const int at = (int)(test_random(&seed) * BATCH * PIXELS * 3), pixel = at / 3;
+        const int at = (int)(test_random(&mini_seed) * BATCH * PIXELS * 3), pixel = at / 3;
         const double step = 1e-7;
         const double color = loss_of(&run, in, truth, 1, at, step) - loss_of(&run, in, truth, 1, at, -step);
         const double error = loss_of(&run, in, truth, 2, pixel, step) - loss_of(&run, in, truth, 2, pixel, -step);
@@ -490,7 +491,7 @@ static void test_restorer(gsf_context* ctx) {
     void* bytes;
     size_t size;
     float* values = (float*)(void*)&c;
-    for (size_t i = 0; i < sizeof c / sizeof *values; i++) values[i] = (float)test_random_in(&seed, 0.1, 1.0);
+    for (size_t i = 0; i < sizeof c / sizeof *values; i++) values[i] = (float)test_random_in(&mini_seed, 0.1, 1.0);
     from_memory = c;
     memset(&desc, 0, sizeof desc);
     CHECK_RESULT(ctx, gsf_nn_make_mini(ctx, &desc, &mini), GSF_ERROR_INVALID_ARGUMENT);
@@ -586,7 +587,7 @@ static void test_int8(gsf_context* ctx) {
     CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 5, made_path()));
     if (!CHECK_OK(ctx, gsf__mini_open(ctx, made_path(), NULL, 0, &net))) return;
     size_t weights = 0, outputs = 0, worst = 0;
-    for (size_t i = 0; i < sizeof random / sizeof *random; i++) random[i] = (float)test_random_in(&seed, -0.3, 0.3);
+    for (size_t i = 0; i < sizeof random / sizeof *random; i++) random[i] = (float)test_random_in(&mini_seed, -0.3, 0.3);
     for (size_t i = 0; i < net.weights.tensor_count; i++) { // a new network's heads are zero
         gsf_nn_tensor* t = net.weights.tensors + i;
         if (t->rank != 4) continue;
@@ -625,7 +626,7 @@ static void test_int8(gsf_context* ctx) {
         gsf__mini_close(ctx, &narrowed);
     }
     float* const to = (float*)(void*)&exact;
-    for (size_t i = 0; i < sizeof exact / sizeof *to; i++) to[i] = (float)test_random_in(&seed, 0.1, 1.0);
+    for (size_t i = 0; i < sizeof exact / sizeof *to; i++) to[i] = (float)test_random_in(&mini_seed, 0.1, 1.0);
     near = exact;
     for (int narrow_file = 1; narrow_file >= 0; narrow_file--) {
         gsf_restorer mini;
@@ -643,7 +644,7 @@ static void test_int8(gsf_context* ctx) {
     gsf__mini_close(ctx, &net);
 }
 
-static void test_memory(void) {
+static void test_mini_memory(void) {
     static clip c;
     counter count;
     gsf_context ctx;
@@ -701,6 +702,6 @@ int main(void) {
     test_gate(&ctx);
     test_restorer(&ctx);
     test_int8(&ctx);
-    test_memory();
+    test_mini_memory();
     return test_report();
 }

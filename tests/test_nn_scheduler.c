@@ -56,7 +56,7 @@ static flow_error run_flow(gsf_context* ctx, const gsf_nn_schedule* schedule, gs
     return error;
 }
 
-static void test_order(gsf_context* ctx, const gsf_nn_schedule* schedule) {
+static void test_schedule_order(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     static const double low[] = {0.9, 1.8, 2.4}; // UniPC's corrector of order 2 makes it third order
     static const double high[] = {1.1, 2.2, 3.3};
     for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++)
@@ -360,7 +360,7 @@ static void test_bad_samplers(gsf_context* ctx, const gsf_nn_schedule* schedule)
     CHECK(s.timesteps == NULL && s.memory == NULL);
 }
 
-static void test_memory(void) {
+static void test_schedule_memory(void) {
     for (size_t k = 1; k <= 4; k++) {
         gsf_context ctx;
         gsf_nn_schedule schedule;
@@ -429,14 +429,14 @@ int main(void) {
     test_context_init(&ctx);
     CHECK_OK(&ctx, gsf_nn_make_schedule(&ctx, NULL, &schedule));
     CHECK(schedule.alpha_bar[999] == 0.0 && schedule.final_alpha_bar == 1.0);
-    test_order(&ctx, &schedule);
+    test_schedule_order(&ctx, &schedule);
     test_formulas(&ctx);
     test_timesteps(&ctx, &schedule);
     test_configs(&ctx);
     test_steep_config(&ctx);
     test_repeatable(&ctx, &schedule);
     test_bad_samplers(&ctx, &schedule);
-    test_memory();
+    test_schedule_memory();
     test_positions(&ctx);
     gsf_nn_destroy_schedule(&ctx, &schedule);
     return test_report();

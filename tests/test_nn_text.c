@@ -11,7 +11,7 @@
 #include "test_hooks.h"
 
 static gsf_context ctx;
-static uint64_t seed = 11;
+static uint64_t text_seed = 11;
 
 // ---- tokenizer: expected ids --------------------------------------------------------
 
@@ -114,7 +114,7 @@ static void test_room(void) {
 
 // ---- tokenizer: unusual texts -------------------------------------------------------
 
-static void check_ids(const gsf_nn_tokenizer* t, const char* text, size_t size) {
+static void check_tokens(const gsf_nn_tokenizer* t, const char* text, size_t size) {
     size_t count = 0;
     int32_t padded[226];
     char* exact = (char*)malloc(size ? size : 1); // so that a sanitizer detects a read past the end
@@ -132,21 +132,21 @@ static void check_ids(const gsf_nn_tokenizer* t, const char* text, size_t size) 
     free(all);
 }
 
-static void test_odd_texts(const gsf_nn_tokenizer* t) {
+static void test_odd_t5_texts(const gsf_nn_tokenizer* t) {
     static const char* const texts[] = {
         "", "\xf0\x9f\x98\x80\xf0\x9f\x9a\x80", "\xf0\x9f\x91\xa9\xe2\x80\x8d\xf0\x9f\x91\xa7", "\x01\x02\x7f\r\n\v",
         "\xff\xfe\xfd", "\xe2\x96", "\xf4\x90\x80\x80", "\xed\xa0\x80", "\xc0\x80", "e\xcc\x81\xcc\x81\xcc\x81",
         "\xef\xbb\xbf", "\xe2\x80\xae", "<extra_id_0><extra_id_0>", "<extra_id_", "<pad", "\xef\xb7\xba\xef\xb7\xba"};
-    for (size_t i = 0; i < sizeof texts / sizeof texts[0]; i++) check_ids(t, texts[i], strlen(texts[i]));
+    for (size_t i = 0; i < sizeof texts / sizeof texts[0]; i++) check_tokens(t, texts[i], strlen(texts[i]));
     char bytes[200];
     for (int round = 0; round < 300; round++) {
-        const size_t size = (size_t)(test_random(&seed) * 200);
+        const size_t size = (size_t)(test_random(&text_seed) * 200);
         const int kind = round % 3;
         for (size_t i = 0; i < size; i++) {
-            const uint64_t bits = test_random_bits(&seed);
+            const uint64_t bits = test_random_bits(&text_seed);
             bytes[i] = kind == 0 ? (char)bits : kind == 1 ? (char)(bits % 95 + 32) : "\xe2\x96\x81 <a>/s"[bits % 9];
         }
-        check_ids(t, bytes, size);
+        check_tokens(t, bytes, size);
     }
 }
 
@@ -190,7 +190,7 @@ static void try_model(const unsigned char* data, size_t size) {
     if (result == GSF_OK) {
         static const char text[] = "ab A\tu[K] \xe4\xb8\xad xyz</s> The video";
         accepted++;
-        check_ids(&t, text, sizeof text - 1);
+        check_tokens(&t, text, sizeof text - 1);
     } else {
         refused++;
         CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED);
@@ -220,19 +220,19 @@ static void test_bad_golden(const char* folder) {
     size_t size;
     snprintf(path, sizeof path, "%s/spiece.model", folder);
     unsigned char* data = (unsigned char*)test_read_file(path, &size);
-    for (int i = 0; i < 40; i++) try_model(data, (size_t)(test_random(&seed) * (double)size));
+    for (int i = 0; i < 40; i++) try_model(data, (size_t)(test_random(&text_seed) * (double)size));
     for (int i = 0; i < 60; i++) {
-        const size_t at = (size_t)(test_random(&seed) * (double)size);
+        const size_t at = (size_t)(test_random(&text_seed) * (double)size);
         const unsigned char kept = data[at];
-        data[at] ^= (unsigned char)(1 + test_random_bits(&seed) % 255);
+        data[at] ^= (unsigned char)(1 + test_random_bits(&text_seed) % 255);
         try_model(data, size);
         data[at] = kept;
     }
     free(data);
     unsigned char noise[512];
     for (int i = 0; i < 500; i++) {
-        const size_t n = (size_t)(test_random(&seed) * sizeof noise);
-        for (size_t k = 0; k < n; k++) noise[k] = (unsigned char)test_random_bits(&seed);
+        const size_t n = (size_t)(test_random(&text_seed) * sizeof noise);
+        for (size_t k = 0; k < n; k++) noise[k] = (unsigned char)test_random_bits(&text_seed);
         try_model(noise, n);
     }
 }
@@ -290,7 +290,7 @@ static void write_file(const char* name, const void* data, size_t size) {
     CHECK_OK(&ctx, gsf_write_file(&ctx, test_scratch(name), data, size));
 }
 
-static void test_configs(void) {
+static void test_tokenizer_configs(void) {
     made_bytes m;
     gsf_nn_tokenizer t;
     int32_t ids[4];
@@ -365,23 +365,23 @@ static int all_zero(const float* x, size_t count) {
     return 1;
 }
 
-enum { BATCH = 2, TOKENS = 37 };
+enum { TEXTS = 2, TOKENS = 37 };
 
 static void make_input(const gsf_nn_t5* net, int32_t* ids, gsf_nn_t5_desc* in) {
     memset(in, 0, sizeof *in);
-    for (int i = 0; i < BATCH * TOKENS; i++) ids[i] = (int32_t)(test_random(&seed) * net->vocabulary);
+    for (int i = 0; i < TEXTS * TOKENS; i++) ids[i] = (int32_t)(test_random(&text_seed) * net->vocabulary);
     in->ids = ids;
-    in->batch = BATCH;
+    in->batch = TEXTS;
     in->tokens = TOKENS;
 }
 
 static void test_t5_runs(void) {
     gsf_nn_t5 net;
     gsf_nn_t5_desc in;
-    int32_t ids[BATCH * TOKENS];
+    int32_t ids[TEXTS * TOKENS];
     gsf_context three;
     if (!CHECK_OK(&ctx, gsf_nn_load_t5(&ctx, t5_folder(), &net))) return;
-    const size_t values = (size_t)BATCH * TOKENS * (size_t)net.width;
+    const size_t values = (size_t)TEXTS * TOKENS * (size_t)net.width;
     float *one = (float*)malloc(values * sizeof(float)), *other = (float*)malloc(values * sizeof(float));
     make_input(&net, ids, &in);
     CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, one));
@@ -390,12 +390,12 @@ static void test_t5_runs(void) {
     CHECK_OK(&three, gsf_init_context(&three));
     CHECK_OK(&three, gsf_nn_encode_t5(&three, &net, &in, other));
     CHECK(memcmp(one, other, values * sizeof(float)) == 0);
-    for (int b = 0; b < BATCH; b++) { // a batch gives the same as its prompts one by one
+    for (int b = 0; b < TEXTS; b++) { // a batch gives the same as its prompts one by one
         gsf_nn_t5_desc single = in;
         single.batch = 1;
         single.ids = ids + b * TOKENS;
         CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &single, other));
-        for (size_t i = 0; i < values / BATCH; i++) CHECK_NEAR(other[i], one[(size_t)b * values / BATCH + i], 2e-5);
+        for (size_t i = 0; i < values / TEXTS; i++) CHECK_NEAR(other[i], one[(size_t)b * values / TEXTS + i], 2e-5);
     }
     in.tokens = 1;
     in.batch = 1;
@@ -427,7 +427,7 @@ static void* measured_alloc(void* user, size_t size) {
 static void test_t5_hooks(void) {
     gsf_nn_t5 net;
     gsf_nn_t5_desc in;
-    int32_t ids[BATCH * TOKENS];
+    int32_t ids[TEXTS * TOKENS];
     gsf_context other;
     counter memory;
     double bytes = 0.0, flops = 0.0;
@@ -441,10 +441,10 @@ static void test_t5_hooks(void) {
     CHECK_OK(&other, gsf_init_context(&other));
     if (!CHECK_OK(&other, gsf_nn_load_t5(&other, t5_folder(), &net))) return;
     make_input(&net, ids, &in);
-    const size_t values = (size_t)BATCH * TOKENS * (size_t)net.width;
+    const size_t values = (size_t)TEXTS * TOKENS * (size_t)net.width;
     float* out = (float*)malloc(values * sizeof(float));
     gsf__nn_query_t5(&net, &in, &bytes, &flops);
-    const double d = net.width, inner = (double)net.heads * net.head_dim, rows = BATCH * TOKENS;
+    const double d = net.width, inner = (double)net.heads * net.head_dim, rows = TEXTS * TOKENS;
     CHECK_NEAR(flops, net.layers * rows * (8 * d * inner + 6 * d * net.hidden + 4 * inner * TOKENS), 1.0);
     largest = 0;
     memset(out, 1, values * sizeof(float));
@@ -618,15 +618,15 @@ int main(int argc, char** argv) {
     gsf_nn_tokenizer golden, made;
     test_made();
     test_room();
-    if (CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, folder, &golden))) test_odd_texts(&golden);
-    if (CHECK_OK(&ctx, open_made(&ctx, MADE_BYTES | MADE_NO_TRIM, &made))) test_odd_texts(&made);
+    if (CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, folder, &golden))) test_odd_t5_texts(&golden);
+    if (CHECK_OK(&ctx, open_made(&ctx, MADE_BYTES | MADE_NO_TRIM, &made))) test_odd_t5_texts(&made);
     gsf_nn_destroy_tokenizer(&ctx, &golden);
     gsf_nn_destroy_tokenizer(&ctx, &made);
     test_long_texts(folder);
     test_bad_made();
     test_bad_golden(folder);
     test_refusals();
-    test_configs();
+    test_tokenizer_configs();
     test_tokenizer_memory();
     test_t5_runs();
     test_t5_hooks();

@@ -11,17 +11,17 @@
 enum { LINEAR, NORM, SOFTMAX, ACTIVATE, ATTENTION, KINDS };
 static const char* const kind_names[KINDS] = {"linear", "norm", "softmax", "activation", "attention"};
 static double worst[KINDS];
-static uint64_t seed = 1;
+static uint64_t layer_seed = 1;
 
 // A layer in double and its loss, the sum of y * dy. p: x, weight, bias, scale, shift, one after another from `at`.
-typedef struct made {
+typedef struct made_layer {
     int kind, option;          // option: bits of the norm's vectors and RMS; the activation
     int64_t rows, in, out, gap, at[6];
     double* p;
     float *values, *dy, *grad, *spare; // grad: as p
-} made;
+} made_layer;
 
-static double loss(const made* m) {
+static double layer_loss(const made_layer* m) {
     double total = 0.0;
     for (int64_t r = 0; r < m->rows; r++) {
         const double *x = m->p + r * (m->in + m->gap), *v[4];
@@ -49,8 +49,8 @@ static double loss(const made* m) {
     return total;
 }
 
-static made make(int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
-    made m = {kind, option, rows, in, out, gap, {0}, NULL, NULL, NULL, NULL, NULL};
+static made_layer make(int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
+    made_layer m = {kind, option, rows, in, out, gap, {0}, NULL, NULL, NULL, NULL, NULL};
     m.at[1] = rows * (in + gap);
     m.at[2] = m.at[1] + (kind == LINEAR ? in * out : out);
     for (int i = 3; i < 6; i++) m.at[i] = m.at[i - 1] + out;
@@ -60,16 +60,16 @@ static made make(int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, i
     m.grad = (float*)calloc(count, sizeof(float));
     m.spare = (float*)malloc(results * sizeof(float));
     m.dy = (float*)malloc(results * sizeof(float));
-    for (size_t i = 0; i < count; i++) m.p[i] = (double)(m.values[i] = (float)test_random_in(&seed, -2.0, 2.0));
-    for (size_t i = 0; i < results; i++) m.dy[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    for (size_t i = 0; i < count; i++) m.p[i] = (double)(m.values[i] = (float)test_random_in(&layer_seed, -2.0, 2.0));
+    for (size_t i = 0; i < results; i++) m.dy[i] = (float)test_random_in(&layer_seed, -1.0, 1.0);
     return m;
 }
 
-static void free_made(made* m) {
+static void free_made(made_layer* m) {
     free(m->p); free(m->values); free(m->grad); free(m->spare); free(m->dy);
 }
 
-static gsf_result backward(gsf_context* ctx, const made* m) {
+static gsf_result backward(gsf_context* ctx, const made_layer* m) {
     const float* v[6];
     float* g[6];
     for (int i = 0; i < 6; i++) {
@@ -98,8 +98,8 @@ static gsf_result backward(gsf_context* ctx, const made* m) {
     return GSF_OK;
 }
 
-static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
-    made m = make(kind, rows, in, out, gap, option);
+static void check_layer(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
+    made_layer m = make(kind, rows, in, out, gap, option);
     CHECK_OK(ctx, backward(ctx, &m));
     double scale = 0.0; // of all gradients of the layer: some are zero or nearly so
     double error = 0.0;
@@ -107,9 +107,9 @@ static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t 
     for (int64_t i = gap ? m.at[1] : 0; i < count; i++) {
         const double before = m.p[i], step = 1e-4;
         m.p[i] = before + step;
-        const double above = loss(&m);
+        const double above = layer_loss(&m);
         m.p[i] = before - step;
-        const double slope = (above - loss(&m)) / (2.0 * step);
+        const double slope = (above - layer_loss(&m)) / (2.0 * step);
         m.p[i] = before;
         if (kind == ACTIVATE && option == GSF__NN_RELU && fabs(before) < 2.0 * step) continue;
         // A slope passes through zero near -0.75: a single value there would have a gradient of rounding errors only.
@@ -124,7 +124,7 @@ static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t 
     others.cpu_level = ctx->cpu_level;
     work_backwards(&others);
     CHECK_OK(&others, gsf_init_context(&others));
-    made again = m;
+    made_layer again = m;
     again.grad = (float*)malloc((size_t)m.at[5] * sizeof(float));
     CHECK_OK(&others, backward(&others, &again));
     CHECK(memcmp(again.grad, m.grad, (size_t)m.at[5] * sizeof(float)) == 0);
@@ -174,8 +174,8 @@ static void test_attention(gsf_context* ctx, int64_t queries, int64_t keys, int 
     double *p = (double*)malloc((size_t)count * sizeof(double)), scale = 0.0, error = 0.0;
     for (int64_t i = 0; i < count; i++) {
         const int is_key = i >= queries * width && i < (queries + keys) * width;
-        p[i] = (double)(values[i] = (float)(test_random_in(&seed, -1.5, 1.5) + (is_key ? offset : 0.0)));
-        dy[i] = (float)test_random_in(&seed, -1.0, 1.0);
+        p[i] = (double)(values[i] = (float)(test_random_in(&layer_seed, -1.5, 1.5) + (is_key ? offset : 0.0)));
+        dy[i] = (float)test_random_in(&layer_seed, -1.0, 1.0);
     }
     gsf_context others;
     memset(&others, 0, sizeof others);
@@ -211,7 +211,7 @@ static void test_attention(gsf_context* ctx, int64_t queries, int64_t keys, int 
     free(p);
 }
 
-static void test_memory(void) {
+static void test_layer_memory(void) {
     counter count;
     memset(&count, 0, sizeof count);
     gsf_context ctx;
@@ -219,7 +219,7 @@ static void test_memory(void) {
     count_memory(&ctx, &count);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     for (int kind = LINEAR; kind <= NORM; kind++) {
-        made m = make(kind, 9, 20, 20, 0, 15);
+        made_layer m = make(kind, 9, 20, 20, 0, 15);
         for (size_t k = 1;; k++) {
             count.calls = 0;
             count.fail_at = k;
@@ -247,17 +247,17 @@ int main(void) {
         if ((int)ctx.cpu_level != level) continue;
         for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
             const int64_t rows = sizes[i][0], in = sizes[i][1];
-            check(&ctx, LINEAR, rows, in, 1, 0, 0);
-            check(&ctx, LINEAR, rows, in, 19, 0, 0);
-            check(&ctx, LINEAR, rows, in, 13, 3, 0);
+            check_layer(&ctx, LINEAR, rows, in, 1, 0, 0);
+            check_layer(&ctx, LINEAR, rows, in, 19, 0, 0);
+            check_layer(&ctx, LINEAR, rows, in, 13, 3, 0);
             if (in > 1) { // the norm of a single value is constant
-                check(&ctx, NORM, rows, in, in, 0, 0);
-                check(&ctx, NORM, rows, in, in, 0, 3);
-                check(&ctx, NORM, rows, in, in, 0, 15);
-                check(&ctx, NORM, rows, in, in, 0, 17);
-                check(&ctx, SOFTMAX, rows, in, in, 0, 0);
+                check_layer(&ctx, NORM, rows, in, in, 0, 0);
+                check_layer(&ctx, NORM, rows, in, in, 0, 3);
+                check_layer(&ctx, NORM, rows, in, in, 0, 15);
+                check_layer(&ctx, NORM, rows, in, in, 0, 17);
+                check_layer(&ctx, SOFTMAX, rows, in, in, 0, 0);
             }
-            for (int a = 0; a < GSF__NN_ACTIVATION_COUNT; a++) check(&ctx, ACTIVATE, rows, in, in, 0, a);
+            for (int a = 0; a < GSF__NN_ACTIVATION_COUNT; a++) check_layer(&ctx, ACTIVATE, rows, in, in, 0, a);
         }
         test_attention(&ctx, 1, 1, 1, 1, 0.0);
         test_attention(&ctx, 7, 7, 3, 5, 0.0);
@@ -266,7 +266,7 @@ int main(void) {
         test_attention(&ctx, 5, 131, 2, 16, -3.0);
         test_attention(&ctx, 193, 257, 1, 64, 0.0);
     }
-    test_memory();
+    test_layer_memory();
     for (int kind = 0; kind < KINDS; kind++) printf("%-10s worst relative L2 error %.2e\n", kind_names[kind], worst[kind]);
     return test_report();
 }

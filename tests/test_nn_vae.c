@@ -305,7 +305,7 @@ static void add_nets(vae_file* f, const vae_shape* s) {
     add_conv(f, s->channels[0], 3, 3, 3, "decoder.conv_out.conv");
 }
 
-static vae_file* make_file(const vae_shape* s) {
+static vae_file* make_vae_file(const vae_shape* s) {
     vae_file* f = (vae_file*)calloc(1, sizeof *f);
     f->seed = 7;
     add_nets(f, s);
@@ -348,7 +348,7 @@ static const char* model_folder(void) {
     return folder;
 }
 
-static const vae_shape tiny = {{6, 12, 20, 0}, 3, 2, 1, 4, 4}; // 4 pixels and 4 frames per latent
+static const vae_shape tiny_vae = {{6, 12, 20, 0}, 3, 2, 1, 4, 4}; // 4 pixels and 4 frames per latent
 
 typedef struct vae_result {
     float *mean, *logvar, *video;
@@ -402,7 +402,7 @@ static void test_levels_and_workers(void) {
     static const int64_t sizes[][3] = {{9, 20, 28}, {17, 9, 7}, {3, 5, 6}, {2, 24, 8}};
     for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
         gsf_context scalar, best, shuffled;
-        vae_file* file = make_file(&shapes[i]);
+        vae_file* file = make_vae_file(&shapes[i]);
         memset(&scalar, 0, sizeof scalar);
         scalar.cpu_level = GSF_CPU_SCALAR;
         CHECK_OK(&scalar, gsf_init_context(&scalar));
@@ -461,7 +461,7 @@ static void metered_free(void* user, void* memory) {
 }
 
 // A run takes the bytes that the query reports, apart from small allocations; more than max_bytes is refused.
-static void test_memory(void) {
+static void test_vae_memory(void) {
     gsf_context ctx;
     gsf_nn_vae vae;
     meter m;
@@ -538,11 +538,11 @@ static void expect_bad(gsf_context* ctx, const vae_file* f, gsf_result code, con
 }
 
 static void test_bad_tensors(gsf_context* ctx) {
-    vae_file* f = make_file(&tiny);
+    vae_file* f = make_vae_file(&tiny_vae);
     gsf_nn_tensor *last = &f->tensors[f->count - 1], *t = file_tensor(f,
                                                                       "decoder.up_blocks.1.upsamplers.0.conv.weight");
     const gsf_nn_tensor kept = *t;
-    save_model(ctx, &tiny, f);
+    save_model(ctx, &tiny_vae, f);
     t->shape[0]--;
     t->count = t->shape[0] * t->shape[1] * 9;
     expect_bad(ctx, f, GSF_ERROR_FORMAT, "decoder.up_blocks.1.upsamplers.0.conv.weight");
@@ -558,11 +558,11 @@ static void test_bad_tensors(gsf_context* ctx) {
     f->count++;
     expect_bad(ctx, f, GSF_ERROR_FORMAT, "decoder.surplus.weight");
     f->tensors[--f->count].data = NULL;
-    save_model(ctx, &tiny, f);
+    save_model(ctx, &tiny_vae, f);
     free_file(f);
 }
 
-static void test_bad_configs(gsf_context* ctx) {
+static void test_vae_bad_configs(gsf_context* ctx) {
     static const struct { const char *more, *text; gsf_result code; } cases[] = {
         {", \"act_fn\": \"gelu\"", "act_fn", GSF_ERROR_UNSUPPORTED},
         {", \"use_quant_conv\": true", "quant_conv", GSF_ERROR_UNSUPPORTED},
@@ -573,19 +573,19 @@ static void test_bad_configs(gsf_context* ctx) {
         {", \"in_channels\": 4", "encoder.conv_in.conv.weight", GSF_ERROR_FORMAT},
     };
     for (size_t i = 0; i < GSF__COUNT(cases); i++) {
-        save_config(ctx, &tiny, cases[i].more);
+        save_config(ctx, &tiny_vae, cases[i].more);
         expect_bad(ctx, NULL, cases[i].code, cases[i].text);
     }
-    vae_shape odd = tiny;
+    vae_shape odd = tiny_vae;
     odd.groups = 4; // does not divide 6 channels
     save_config(ctx, &odd, "");
     expect_bad(ctx, NULL, GSF_ERROR_FORMAT, "norm_num_groups");
-    save_config(ctx, &tiny, "");
+    save_config(ctx, &tiny_vae, "");
 }
 
 // ---- NaN, cancellation, out of memory
 
-static int all_zero(const float* x, size_t count) {
+static int only_zeros(const float* x, size_t count) {
     for (size_t i = 0; i < count; i++)
         if (x[i] != 0.0f) return 0;
     return 1;
@@ -601,7 +601,7 @@ static void test_nan(gsf_context* ctx) {
     gsf_nn_vae vae;
     uint64_t seed = 9;
     float *latents = random_floats(&seed, 4 * FRAMES * SIDE * SIDE, 1.0), *video = (float*)malloc(PIXELS * sizeof(float));
-    vae_file* f = make_file(&tiny);
+    vae_file* f = make_vae_file(&tiny_vae);
     CHECK_OK(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae));
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = NAN;
     CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
@@ -613,7 +613,7 @@ static void test_nan(gsf_context* ctx) {
     memset(video, 1, PIXELS * sizeof(float));
     CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
     CHECK(strstr(ctx->error, "chunk 2 of 2") != NULL); // frame 4 of 5
-    CHECK(all_zero(video, PIXELS));
+    CHECK(only_zeros(video, PIXELS));
     gsf_nn_destroy_vae(ctx, &vae);
     for (int i = 0; i < 4; i++) latents[(i * FRAMES + 4) * SIDE * SIDE + 5] = 0.5f;
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 0.5f;
@@ -621,14 +621,14 @@ static void test_nan(gsf_context* ctx) {
         float* w = (float*)(uintptr_t)file_tensor(f, layers[i])->data;
         const float kept = w[1];
         w[1] = NAN;
-        save_model(ctx, &tiny, f);
+        save_model(ctx, &tiny_vae, f);
         w[1] = kept;
         CHECK_OK(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae));
         CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
         if (!CHECK(strstr(ctx->error, named[i]) != NULL)) fprintf(stderr, "%s (wanted %s)\n", ctx->error, named[i]);
         gsf_nn_destroy_vae(ctx, &vae);
     }
-    save_model(ctx, &tiny, f);
+    save_model(ctx, &tiny_vae, f);
     free_file(f);
     free(latents);
     free(video);
@@ -645,7 +645,7 @@ static void cancel_soon(void* user, const char* stage, double done, double total
     if (++c->calls == 2) gsf_request_cancel(c->ctx);
 }
 
-static void test_cancel(void) {
+static void test_vae_cancel(void) {
     gsf_context ctx;
     gsf_nn_vae vae;
     canceller c;
@@ -660,7 +660,7 @@ static void test_cancel(void) {
     CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, model_folder(), &vae));
     CHECK_RESULT(&ctx, gsf_nn_encode_vae(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL), GSF_ERROR_CANCELLED);
     CHECK(c.calls == 2 && c.total == 4.0);
-    CHECK(all_zero(mean, 4 * 9 * 2 * 2));
+    CHECK(only_zeros(mean, 4 * 9 * 2 * 2));
     gsf_clear_cancel(&ctx);
     c.done = 0.0;
     CHECK_OK(&ctx, gsf_nn_encode_vae(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL));
@@ -714,19 +714,19 @@ int main(void) {
     test_convolve();
     test_maps();
     test_levels_and_workers();
-    vae_file* file = make_file(&tiny);
-    save_model(&ctx, &tiny, file);
+    vae_file* file = make_vae_file(&tiny_vae);
+    save_model(&ctx, &tiny_vae, file);
     free_file(file);
     CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, model_folder(), &vae));
     test_sizes(&ctx, &vae);
     test_tiles(&ctx, &vae);
     gsf_nn_destroy_vae(&ctx, &vae);
-    test_memory();
+    test_vae_memory();
     test_nan(&ctx);
-    test_cancel();
+    test_vae_cancel();
     test_no_memory();
     test_bad_tensors(&ctx);
-    test_bad_configs(&ctx);
+    test_vae_bad_configs(&ctx);
     CHECK(warnings == 0);
     return test_report();
 }

@@ -1,7 +1,7 @@
 // test_scene.c - splat files, COLMAP models, transforms.json, undistortion, view images: golden data, round trips,
 // every truncation, flipped bytes, failing allocations. GSF_FOX may name a folder with the fox photos (see the last
 // test).
-#define _DEFAULT_SOURCE // symlink, mkfifo
+#define _DEFAULT_SOURCE 1 // symlink, mkfifo
 #define GSFIXER_IMPLEMENTATION
 #include <sys/stat.h>
 #include <unistd.h>
@@ -9,7 +9,7 @@
 #include "test.h"
 #include "test_hooks.h"
 
-static gsf_context make_context(counter* c) {
+static gsf_context make_counted_context(counter* c) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     memset(c, 0, sizeof *c);
@@ -20,15 +20,8 @@ static gsf_context make_context(counter* c) {
     return ctx;
 }
 
-static char* exact_copy(const void* data, size_t size) { // so that ASan detects a read one byte past the end
-    char* p = (char*)malloc(size ? size : 1);
-    if (size) memcpy(p, data, size);
-    if (!size) { free(p); return NULL; }
-    return p;
-}
-
 // Results with which a reader may refuse an invalid file.
-static int is_refusal(gsf_result r) {
+static int is_reader_refusal(gsf_result r) {
     return r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED || r == GSF_ERROR_NUMERIC || r == GSF_ERROR_DEGENERATE;
 }
 
@@ -36,7 +29,7 @@ static int is_refusal(gsf_result r) {
 
 static void compare_ply(const char* file, const char* tensors, double tolerance) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s;
     if (!CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden(file), &s))) return;
     test_tensors t = test_open_tensors(test_golden(tensors));
@@ -74,7 +67,7 @@ static void test_ply_golden(void) {
     compare_ply("splat/ply/small_deg1_bigendian_double.ply", "splat/ply/small_deg1.safetensors", 0);
 
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s;
     if (!CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden("splat/ply/random_deg3.ply"), &s))) return;
     test_tensors t = test_open_tensors(test_golden("splat/scenes/random.safetensors"));
@@ -103,7 +96,7 @@ static void test_ply_bad(void) {
                                         "04_no_end_header", "06_missing_property", "07_bad_magic", "08_count_overflow",
                                         "09_list_property", "10_frest_count_7"};
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s;
     for (size_t i = 0; i < sizeof names / sizeof names[0]; i++) {
         char relative[128];
@@ -128,11 +121,11 @@ static void test_ply_damage(const char* relative, int all_values) {
     size_t size;
     char* file = test_read_file(test_golden(relative), &size);
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s;
     const int32_t is_text = strstr(relative, "ascii") != NULL;
     for (size_t cut = 0; cut < size; cut++) {
-        char* part = exact_copy(file, cut);
+        char* part = (char*)exact_copy(file, cut);
         const gsf_result r = gsf_splat_parse(&ctx, "cut.ply", part, cut, &s);
         // the last number of a text file may lose digits and its line feed
         CHECK(is_text && cut + 32 > size ? r == GSF_OK || r == GSF_ERROR_FORMAT : r == GSF_ERROR_FORMAT);
@@ -141,12 +134,12 @@ static void test_ply_damage(const char* relative, int all_values) {
     }
     const char* mark = strstr(file, "end_header\n");
     const size_t header = (size_t)(mark - file) + 11;
-    char* whole = exact_copy(file, size);
+    char* whole = (char*)exact_copy(file, size);
     for (size_t at = 0; at < size; at += at < header ? 1 : 7)
         for (int flip = 1; flip < 256; flip += at < header && all_values ? 1 : 85) {
             whole[at] = (char)(file[at] ^ flip);
             const gsf_result r = gsf_splat_parse(&ctx, "flip.ply", whole, size, &s);
-            CHECK(r == GSF_OK || is_refusal(r));
+            CHECK(r == GSF_OK || is_reader_refusal(r));
             if (r != GSF_OK) CHECK(strncmp(ctx.error, "flip.ply", 8) == 0 && s.owned == NULL);
             gsf_splat_destroy(&ctx, &s);
             whole[at] = file[at];
@@ -162,7 +155,7 @@ static void test_ply_out_of_memory(const char* relative) {
     size_t k = 1;
     for (;; k++) {
         counter count;
-        gsf_context ctx = make_context(&count);
+        gsf_context ctx = make_counted_context(&count);
         gsf_splats s;
         count.fail_at = k;
         const gsf_result r = gsf_splat_parse(&ctx, "oom.ply", file, size, &s);
@@ -188,7 +181,7 @@ static void test_ply_out_of_memory(const char* relative) {
 // Positions far from zero keep their precision when saved and loaded; those near zero are saved as float32.
 static void test_ply_origin(void) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s, again;
     CHECK_OK(&ctx, gsf_splat_make(&ctx, 500, 1, &s));
     uint64_t seed = 7;
@@ -231,7 +224,7 @@ static void test_ply_variants(void) { // elements before and after the vertices,
         "1 2\r\n3 4\r\n-5 300 1.5e0 .25 -0.1 +1E-3 12345678901234567890123 0 0 0 1 0 0 0\r\n"
         "1 2 3 4 5 6 nan 0 0 0 1 0 0 0\r\n3 0 1 2\r\n";
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_splats s;
     CHECK_OK(&ctx, gsf_splat_parse(&ctx, "variant.ply", text, sizeof text - 1, &s));
     CHECK(s.count == 1 && warnings == 1);
@@ -285,7 +278,7 @@ static void disk_put(memory_disk* disk, const char* path, const char* text) {
 }
 static void disk_put_photo(memory_disk* disk, const char* path, int width, int height, int seed) { // a smooth PNG
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_image image;
     gsf_buffer png;
     memset(&png, 0, sizeof png);
@@ -306,7 +299,7 @@ static void disk_free(memory_disk* disk) {
     disk->count = 0;
 }
 static gsf_context make_disk_context(counter* c, memory_disk* disk) {
-    gsf_context ctx = make_context(c);
+    gsf_context ctx = make_counted_context(c);
     ctx.io.read_fn = disk_read;
     ctx.io.write_fn = disk_write;
     ctx.io.user = disk;
@@ -346,7 +339,7 @@ static gsf_result parse_model(gsf_context* ctx, int32_t is_text, const model_fil
 
 static void test_colmap_golden(int32_t is_text) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     if (!CHECK_OK(&ctx, parse_model(&ctx, is_text, &files, &scene))) return;
@@ -408,7 +401,7 @@ static void test_colmap_golden(int32_t is_text) {
 // The golden SIMPLE_RADIAL camera: OpenCV's maps and its remapped, cropped image.
 static void test_undistort_golden(void) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     model_files files = read_model("splat/colmap/bin", "bin");
     if (!CHECK_OK(&ctx, parse_model(&ctx, 0, &files, &scene))) return;
@@ -474,7 +467,7 @@ static void test_colmap_bad(void) {
         {"13_points_missing", GSF_OK, NULL},
     };
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
         char folder[128];
@@ -506,7 +499,7 @@ static void test_colmap_bad(void) {
 static void test_colmap_damage(int32_t is_text) {
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     for (int f = 0; f < 3; f++) {
         model_files cut = files;
@@ -515,7 +508,7 @@ static void test_colmap_damage(int32_t is_text) {
             cut.size[f] = size;
             const gsf_result r = parse_model(&ctx, is_text, &cut, &scene);
             if (!cut.data[f] && f == 2) CHECK(r == GSF_OK); // no file means no points
-            else CHECK(is_text ? r == GSF_OK || is_refusal(r) : r == GSF_ERROR_FORMAT);
+            else CHECK(is_text ? r == GSF_OK || is_reader_refusal(r) : r == GSF_ERROR_FORMAT);
             gsf_splat_destroy_scene(&ctx, &scene);
             free(cut.data[f]);
         }
@@ -525,7 +518,7 @@ static void test_colmap_damage(int32_t is_text) {
                 files.data[f][at] = (char)(was ^ flip);
                 count.asked = 0;
                 const gsf_result r = parse_model(&ctx, is_text, &files, &scene);
-                CHECK(r == GSF_OK || is_refusal(r));
+                CHECK(r == GSF_OK || is_reader_refusal(r));
                 CHECK(count.asked < 1000000);
                 gsf_splat_destroy_scene(&ctx, &scene);
                 files.data[f][at] = was;
@@ -539,7 +532,7 @@ static void test_colmap_out_of_memory(int32_t is_text) {
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     for (size_t k = 1;; k++) {
         counter count;
-        gsf_context ctx = make_context(&count);
+        gsf_context ctx = make_counted_context(&count);
         gsf_scene scene;
         count.fail_at = k;
         const gsf_result r = parse_model(&ctx, is_text, &files, &scene);
@@ -596,7 +589,7 @@ static void test_colmap_text(void) {
         {"7 SIMPLE_DIVISION 40 30 35 20 15 1e300", images, NULL, "leaves no image"},
     };
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     CHECK_OK(&ctx,
              parse_text(&ctx, cameras, images, "9 1 2 3 4 5 6 -1 4 0 3 0 4 1 88 2\n8 nan 0 0 0 0 0 0 4 0\n", &scene));
@@ -609,7 +602,7 @@ static void test_colmap_text(void) {
     gsf_splat_destroy_scene(&ctx, &scene);
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
         const gsf_result r = parse_text(&ctx, bad[i].cameras, bad[i].images, bad[i].points, &scene);
-        if (!CHECK(is_refusal(r) && strstr(ctx.error, bad[i].says)))
+        if (!CHECK(is_reader_refusal(r) && strstr(ctx.error, bad[i].says)))
             fprintf(stderr, "  case %zu: %s (%s)\n", i, ctx.error, gsf_describe_result(r));
         gsf_splat_destroy_scene(&ctx, &scene);
     }
@@ -678,7 +671,7 @@ static void test_lenses(void) {
                                           {60, 62, 51, 37},
                                           {60, 62, 51, 37, 0.6, 1.2}};
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     for (int model = 0; model < 17; model++) {
         gsf__sfm m;
         gsf__rectify r;
@@ -719,7 +712,7 @@ static void test_lenses(void) {
 // pixel.
 static void test_colmap_lenses(const char* folder, size_t camera_count) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene;
     model_files files = read_model_at(folder, "bin");
     if (!CHECK(files.data[2] != NULL) || !CHECK_OK(&ctx, parse_model(&ctx, 0, &files, &scene))) return;
@@ -753,7 +746,7 @@ static void test_colmap_lenses(const char* folder, size_t camera_count) {
 static void test_panorama(void) {
     char bytes[8 + 24 + 16] = {1};
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     model_files files = read_model("splat/colmap/bin", "bin");
     gsf_bytes cameras = {bytes, sizeof bytes, "cameras.bin"}, images = {files.data[1], files.size[1], NULL};
     gsf_scene scene;
@@ -921,7 +914,7 @@ static void test_photo_alpha(void) {
                                           "1 OPENCV 30 20 25 25 15 10 -0.2 0.05 0.001 0.002\n"};
     static uint8_t rgba[4 * 60 * 40], grey[2 * 60 * 40], rgb[3 * 60 * 40];
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     draw_object(60, 40, rgba);
     for (int i = 0; i < 60 * 40; i++) {
         grey[2 * i] = rgba[4 * i];
@@ -1005,7 +998,7 @@ static void test_photo_masks(void) {
 #ifdef __linux__
     static uint8_t rgba[4 * 60 * 40], rgb[3 * 60 * 40], half[60 * 40], large[120 * 80];
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     char folder[500], path[4000];
     snprintf(folder, sizeof folder, "%s", test_scratch("masks"));
     snprintf(path, sizeof path, "rm -rf '%s' && mkdir -p '%s/sparse' '%s/images' '%s/masks'", folder, folder, folder, folder);
@@ -1070,7 +1063,7 @@ static void test_photo_masks(void) {
 static void test_unreadable_photos(void) {
 #ifdef __linux__
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     char folder[500], path[2000];
     gsf_image image;
     snprintf(folder, sizeof folder, "%s", test_scratch("unreadable"));
@@ -1279,7 +1272,7 @@ static void test_transforms(void) {
     };
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
         const gsf_result r = parse_json_scene(&ctx, bad[i].text, strlen(bad[i].text), &scene);
-        if (!CHECK(is_refusal(r) && strstr(ctx.error, bad[i].says)))
+        if (!CHECK(is_reader_refusal(r) && strstr(ctx.error, bad[i].says)))
             fprintf(stderr, "  case %zu: %s (%s)\n", i, ctx.error, gsf_describe_result(r));
     }
     disk_put(&disk, "n/transforms.json",
@@ -1289,16 +1282,16 @@ static void test_transforms(void) {
              "{\"fl_x\":9,\"ply_file_path\":\"x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
     scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_NOT_FOUND);
     for (size_t size = 0; size < sizeof nerfstudio - 1; size++) { // every truncation
-        char* cut = exact_copy(nerfstudio, size);
+        char* cut = (char*)exact_copy(nerfstudio, size);
         CHECK(parse_json_scene(&ctx, cut, size, &scene) == GSF_ERROR_FORMAT);
         free(cut);
     }
-    char* whole = exact_copy(nerfstudio, sizeof nerfstudio - 1);
+    char* whole = (char*)exact_copy(nerfstudio, sizeof nerfstudio - 1);
     for (size_t at = 0; at < sizeof nerfstudio - 1; at++)
         for (int flip = 1; flip < 256; flip += 7) {
             whole[at] = (char)(nerfstudio[at] ^ flip);
             const gsf_result r = parse_json_scene(&ctx, whole, sizeof nerfstudio - 1, &scene);
-            CHECK(r == GSF_OK || is_refusal(r));
+            CHECK(r == GSF_OK || is_reader_refusal(r));
             gsf_splat_destroy_scene(&ctx, &scene);
             whole[at] = nerfstudio[at];
         }
@@ -1321,7 +1314,7 @@ static void test_transforms(void) {
 
 static void test_split(void) {
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     size_t size, tables = 0;
     char* text = test_read_file(test_golden("traj/tables.json"), &size);
     gsf_json json;
@@ -1385,7 +1378,7 @@ static void test_fox_photos(void) {
     }
     fclose(file);
     counter count;
-    gsf_context ctx = make_context(&count);
+    gsf_context ctx = make_counted_context(&count);
     gsf_scene scene = load_folder(&ctx, folder, 0, 0, GSF_OK);
     size_t size, n_train, n_test;
     char* text = test_read_file(path, &size);

@@ -77,7 +77,7 @@ static void print_table(void) {
 static double now(void) { return gsf__seconds(); }
 
 // One line with the worst values of the rows from `first` on.
-static void print_worst(FILE* out, const char* test, size_t first, double seconds) {
+static void print_case(FILE* out, const char* test, size_t first, double seconds) {
     row worst;
     memset(&worst, 0, sizeof worst);
     worst.clear_error = worst.unclear_error = worst.depth_error = worst.gradient = -1;
@@ -235,7 +235,7 @@ static void scene_free(scene* s) { gsf_splat_destroy(&levels[0].ctx, &s->splats)
 
 // ---- a scene against the reference ---------------------------------------------
 
-typedef struct oracle {
+typedef struct stressed_oracle {
     const scene* s;
     ref_image image;
     ref_grads grads;
@@ -244,10 +244,10 @@ typedef struct oracle {
     uint8_t* skip;     // unclear pixels
     size_t pixels, unclear;
     double brightest, farthest;
-} oracle;
+} stressed_oracle;
 
-static oracle oracle_make(const scene* s) {
-    oracle o;
+static stressed_oracle make_stressed_oracle(const scene* s) {
+    stressed_oracle o;
     memset(&o, 0, sizeof o);
     o.s = s;
     ref_splats wide = ref_splats_from(&s->splats);
@@ -285,7 +285,7 @@ static oracle oracle_make(const scene* s) {
     return o;
 }
 
-static void oracle_free(oracle* o) {
+static void free_stressed_oracle(stressed_oracle* o) {
     ref_destroy_image(&o->image);
     ref_destroy_grads(&o->grads);
     free(o->l.d_color); free(o->l.d_depth); free(o->l.d_alpha);
@@ -308,7 +308,7 @@ static void difference(const float* actual, const double* expected, size_t count
 // Relative L2 of the worst parameter tensor. Log-scales and quaternions have the same unit; if all splats are
 // spherical, the gradient of the quaternions vanishes, so its norm is taken as at least a hundredth of that of the
 // scales.
-static double gradient_error(const oracle* o, const result* r) {
+static double gradient_error(const stressed_oracle* o, const result* r) {
     const size_t n = o->s->splats.count;
     const struct { const float* actual; const double* expected; size_t rows, width; } list[] = {
         {r->grads.log_scales, o->grads.log_scales, n, 3}, {r->grads.quats, o->grads.quats, n, 4},
@@ -333,7 +333,7 @@ static void check_limit(const row* r, const char* what, double error, double lim
         fprintf(stderr, "%s, %s, %s: %s %.3g, allowed %.3g\n", r->test, r->name, r->level, what, error, limit);
 }
 
-static void compare(const char* test, const oracle* o, const machine* m, const result* r, const limits* allowed) {
+static void compare(const char* test, const stressed_oracle* o, const machine* m, const result* r, const limits* allowed) {
     row* w = add_row(test, o->s->name, m->name);
     w->pixels = o->pixels;
     w->unclear = o->unclear;
@@ -356,14 +356,14 @@ static void compare(const char* test, const oracle* o, const machine* m, const r
     check_limit(w, "gradients are off by", w->gradient, allowed->gradient);
 }
 
-static void check_scene(const char* test, const scene* s, const limits* allowed) {
-    oracle o = oracle_make(s);
+static void check_stressed_scene(const char* test, const scene* s, const limits* allowed) {
+    stressed_oracle o = make_stressed_oracle(s);
     for (size_t k = 0; k < level_count; k++) {
         result r = render(&levels[k], &s->splats, &s->camera, &s->desc, &o.l);
         compare(test, &o, &levels[k], &r, allowed);
         result_free(&r);
     }
-    oracle_free(&o);
+    free_stressed_oracle(&o);
 }
 
 static void check_recipes(const char* test, const recipe* list, size_t count, const limits* allowed) {
@@ -371,7 +371,7 @@ static void check_recipes(const char* test, const recipe* list, size_t count, co
         recipe r = list[k];
         if (!r.seed) r.seed = k + 1;
         scene s = scene_make(&r);
-        check_scene(test, &s, allowed);
+        check_stressed_scene(test, &s, allowed);
         scene_free(&s);
     }
 }
@@ -468,7 +468,7 @@ static void test_stacks(void) {
         r.z_high = 9;
         r.layers = 1; // 5000 and 1787 have no common divisor
         scene s = scene_make(&r);
-        check_scene("stacks", &s, &crowded);
+        check_stressed_scene("stacks", &s, &crowded);
         scene_free(&s);
     }
 }
@@ -487,7 +487,7 @@ static void test_quaternions(void) {
         for (int k = 0; k < 4; k++) q[k] = (float)((double)q[k] * length);
         if (i % 10 == 1) q[1] = q[2] = q[3] = 0;
     }
-    check_scene("quaternions", &s, &ordinary);
+    check_stressed_scene("quaternions", &s, &ordinary);
     scene_free(&s);
     r.shape = 1;
     r.aspect_low = r.aspect_high = 1e3;
@@ -495,7 +495,7 @@ static void test_quaternions(void) {
     s = scene_make(&r);
     for (size_t i = 0; i < s.splats.count; i++)
         for (size_t k = 0; k < 4; k++) s.splats.quats[4 * i + k] *= i % 2 ? 1e-6f : 1e6f;
-    check_scene("quaternions", &s, &ordinary);
+    check_stressed_scene("quaternions", &s, &ordinary);
     scene_free(&s);
 }
 
@@ -527,7 +527,7 @@ static void test_ties(void) {
         s.splats.means[3 * i + 2] = (float)floor(16 * (double)s.splats.means[3 * i + 2]) / 16;
     }
     s.exact_ties = 1;
-    check_scene("ties", &s, &ordinary);
+    check_stressed_scene("ties", &s, &ordinary);
 
     const size_t n = s.splats.count;
     gsf_splats turned;
@@ -543,13 +543,13 @@ static void test_ties(void) {
     scene t = s;
     t.splats = turned;
     t.name = "the same turned round";
-    oracle a = oracle_make(&s), b = oracle_make(&t);
+    stressed_oracle a = make_stressed_oracle(&s), b = make_stressed_oracle(&t);
     double change = 0;
     for (size_t i = 0; i < 3 * a.pixels; i++) change = fmax(change, fabs(a.image.color[i] - b.image.color[i]));
     CHECK(change > 0.1);
-    oracle_free(&a);
-    oracle_free(&b);
-    check_scene("ties", &t, &ordinary);
+    free_stressed_oracle(&a);
+    free_stressed_oracle(&b);
+    check_stressed_scene("ties", &t, &ordinary);
     scene_free(&t);
     scene_free(&s);
 }
@@ -569,7 +569,7 @@ static void test_image_sizes(void) {
 }
 
 // Every parameter is NaN or infinite in some splat: such splats are treated as hidden, and no gradient comes from them.
-static void test_not_finite(void) {
+static void test_stress_not_finite(void) {
     enum { PARAMETERS = 3 + 3 + 4 + 1 + 48, BROKEN = 3 * PARAMETERS };
     static const float values[3] = {NAN, INFINITY, -INFINITY};
     recipe r;
@@ -594,7 +594,7 @@ static void test_not_finite(void) {
             *at = values[k % 3];
         }
         s.desc.hidden = hidden;
-        oracle o = oracle_make(&s);
+        stressed_oracle o = make_stressed_oracle(&s);
         for (size_t k = 0; k < level_count; k++) {
             result expected = render(&levels[k], &s.splats, &s.camera, &s.desc, &o.l);
             result actual = render(&levels[k], &t.splats, &t.camera, &t.desc, &o.l);
@@ -604,7 +604,7 @@ static void test_not_finite(void) {
             result_free(&expected);
             result_free(&actual);
         }
-        oracle_free(&o);
+        free_stressed_oracle(&o);
         free(hidden);
         scene_free(&s);
         scene_free(&t);
@@ -691,7 +691,7 @@ static void test_sweep(void) {
                 r.sh_degree = (int32_t)(f % 4);
                 r.antialiased = (int)(n + f + a) % 3 == 0;
                 scene s = scene_make(&r);
-                check_scene("sweep", &s, &crowded); // a scene of 4480 pixels is too small for shares of 0.1 %
+                check_stressed_scene("sweep", &s, &crowded); // a scene of 4480 pixels is too small for shares of 0.1 %
                 scene_free(&s);
             }
     size_t pixels = 0, unclear = 0;
@@ -820,7 +820,7 @@ static double relative_l2(const float* a, const float* b, double b_scale, size_t
 // The image and gradients of the base scene against those of the same scene scaled by `scale`. Scaled parameters are
 // rounded again (log-scales by 2^-24 of their value, which changes a splat's size by up to 5e-7), so the limits are
 // those of the accuracy.
-static void compare_scaled(const char* name, const machine* m, const oracle* base, const result* a, const result* b,
+static void compare_scaled(const char* name, const machine* m, const stressed_oracle* base, const result* a, const result* b,
                            double scale) {
     row* w = add_row("invariance", name, m->name);
     const size_t n = a->splat_count;
@@ -858,7 +858,7 @@ static void test_invariance(void) {
     r.seed = 9;
     r.count = 300;
     scene base = scene_make(&r);
-    oracle o = oracle_make(&base);
+    stressed_oracle o = make_stressed_oracle(&base);
     for (size_t m = 0; m < level_count; m++) {
         result a = render(&levels[m], &base.splats, &base.camera, &base.desc, &o.l);
         for (size_t k = 0; k < 2 * COUNT(scales) + 1; k++) {
@@ -881,7 +881,7 @@ static void test_invariance(void) {
         }
         result_free(&a);
     }
-    oracle_free(&o);
+    free_stressed_oracle(&o);
 
     // where the offset is exact in double (axes parallel to the world's, integers), the results are identical
     memset(base.camera.w2c, 0, sizeof base.camera.w2c);
@@ -892,7 +892,7 @@ static void test_invariance(void) {
     scene away = base;
     memcpy(away.splats.origin, far_away, sizeof far_away);
     move_camera(&away.camera, far_away);
-    o = oracle_make(&base);
+    o = make_stressed_oracle(&base);
     for (size_t m = 0; m < level_count; m++) {
         result a = render(&levels[m], &base.splats, &base.camera, &base.desc, &o.l);
         result b = render(&levels[m], &away.splats, &away.camera, &away.desc, &o.l);
@@ -900,7 +900,7 @@ static void test_invariance(void) {
         result_free(&a);
         result_free(&b);
     }
-    oracle_free(&o);
+    free_stressed_oracle(&o);
     scene_free(&base);
 }
 
@@ -969,9 +969,9 @@ static void test_backgrounds(void) {
         if (r.official == 3) s.desc.footprint = GSF_FOOTPRINT_FULL;
         const float colors[3] = {0.7f, 0.3f, 0.9f};
         memcpy(s.desc.background, colors, sizeof colors);
-        check_scene("backgrounds", &s, &crowded);
+        check_stressed_scene("backgrounds", &s, &crowded);
 
-        oracle o = oracle_make(&s);
+        stressed_oracle o = make_stressed_oracle(&s);
         difference_case d;
         d.s = ref_splats_from(&s.splats);
         d.scene = &s;
@@ -994,7 +994,7 @@ static void test_backgrounds(void) {
         check_limit(w, "gradients are off by", w->gradient, 1e-6);
         ref_destroy_grads(&g);
         ref_destroy_splats(&d.s);
-        oracle_free(&o);
+        free_stressed_oracle(&o);
         scene_free(&s);
     }
 }
@@ -1345,7 +1345,7 @@ int main(int argc, char** argv) {
     static const test_entry tests[] = {
         {"shapes", test_shapes}, {"depths", test_depths}, {"sizes", test_sizes}, {"opacities", test_opacities},
         {"stacks", test_stacks}, {"quaternions", test_quaternions}, {"offsets", test_offsets}, {"ties", test_ties},
-        {"image sizes", test_image_sizes}, {"not finite", test_not_finite}, {"huge values", test_huge_values},
+        {"image sizes", test_image_sizes}, {"not finite", test_stress_not_finite}, {"huge values", test_huge_values},
         {"sweep", test_sweep}, {"culling", test_culling}, {"invariance", test_invariance},
         {"backgrounds", test_backgrounds}, {"training", test_training_bits}, {"invisible", test_invisible},
         {"scaled", test_scaled_training}, {"long run", test_long_run},
@@ -1364,7 +1364,7 @@ int main(int argc, char** argv) {
         const size_t first = row_count;
         const double start = now();
         tests[k].run();
-        print_worst(out, tests[k].name, first, now() - start);
+        print_case(out, tests[k].name, first, now() - start);
     }
     for (size_t k = 0; k < level_count; k++) machine_close(&levels[k]);
     if (json) print_table();

@@ -12,7 +12,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { VIEWS = 4, WIDTH = 32, HEIGHT = 24, POINTS = 60, ITERATIONS = 8 };
+enum { VIEWS = 4, WIDTH = 20, HEIGHT = 15, FOCAL = 18, POINTS = 60, ITERATIONS = 8 };
 
 static char scene_folder[600], out_folder[600];
 static const char* const outputs[] = { // in the order in which they are written
@@ -311,7 +311,7 @@ static void photo_of(gsf_context* ctx, double x, double y, double turn, const ch
     if (!CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, WIDTH, HEIGHT, 3, &image))) return;
     for (int row = 0; row < HEIGHT; row++)
         for (int column = 0; column < WIDTH; column++) {
-            const double u = (column + 0.5 - WIDTH / 2) / 28, v = (row + 0.5 - HEIGHT / 2) / 28;
+            const double u = (column + 0.5 - WIDTH / 2.0) / FOCAL, v = (row + 0.5 - HEIGHT / 2.0) / FOCAL;
             const double depth = 4 / (cos(turn) - sin(turn) * u), at_x = x + depth * (cos(turn) * u + sin(turn));
             for (int c = 0; c < 3; c++)
                 ((uint8_t*)image.data)[3 * (row * WIDTH + column) + c] =
@@ -335,7 +335,7 @@ static void make_inputs(void) {
     FILE* images = fopen(in(scene_folder, "sparse/0/images.txt"), "w");
     FILE* points = fopen(in(scene_folder, "sparse/0/points3D.txt"), "w");
     if (!CHECK(cameras && images && points)) exit(1);
-    fprintf(cameras, "1 SIMPLE_RADIAL %d %d 28 %d %d 0.02\n", WIDTH, HEIGHT, WIDTH / 2, HEIGHT / 2);
+    fprintf(cameras, "1 SIMPLE_RADIAL %d %d %d %g %g 0.02\n", WIDTH, HEIGHT, FOCAL, WIDTH / 2.0, HEIGHT / 2.0);
     for (int i = 0; i < VIEWS; i++) {
         const double x = 0.3 * i - 0.45, y = i % 2 ? 0.1 : -0.1, turn = -0.2 * x;
         char name[20];

@@ -5,7 +5,7 @@
 #include "gsfixer_splat.h"
 #include "test.h"
 
-enum { WIDTH = 44, HEIGHT = 36, VIEWS = 5, SPLATS = 70 };
+enum { WIDTH = 44, HEIGHT = 36, SCENE_VIEWS = 5, SPLATS = 70 };
 
 static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
     const int workers = *(const int*)user;
@@ -288,7 +288,7 @@ static void test_smoothness_derivative(gsf_context* ctx) {
 
 // ---- Adam and regularisers on a bare model ---------------------------------------
 
-static gsf__model make_model(gsf_context* ctx, size_t count, int32_t sh_degree) {
+static gsf__model make_small_model(gsf_context* ctx, size_t count, int32_t sh_degree) {
     gsf__model model;
     memset(&model, 0, sizeof model);
     model.sh_degree = sh_degree;
@@ -306,7 +306,7 @@ static gsf__model make_model(gsf_context* ctx, size_t count, int32_t sh_degree) 
 // Bad gradients have no effect and are counted; rows after them are unchanged.
 static void test_adam_rejects(gsf_context* ctx) {
     for (int32_t degree = 0; degree <= 3; degree++) {
-        gsf__model model = make_model(ctx, 37, degree);
+        gsf__model model = make_small_model(ctx, 37, degree);
         gsf__group* sh = &model.groups[GSF__SH];
         for (size_t i = 37 * sh->width; i < model.capacity * sh->width; i++) sh->grad[i] = 1.0f;
         const float before = sh->value[2], quat = model.groups[GSF__QUATS].value[147];
@@ -332,7 +332,7 @@ static void test_adam_rejects(gsf_context* ctx) {
 static void test_adam_bands(gsf_context* ctx) { // skipping bands that never had a gradient changes nothing
     for (int32_t degree = 1; degree <= 3; degree++)
         for (int32_t bands = 1; bands <= degree; bands++) {
-            gsf__model a = make_model(ctx, 21, degree), b = make_model(ctx, 21, degree);
+            gsf__model a = make_small_model(ctx, 21, degree), b = make_small_model(ctx, 21, degree);
             const gsf__adam_rates rates = {0.1, 0.2, 0.3, 0.4, 0.5, 0.6};
             for (int32_t step = 1; step <= 3; step++) {
                 for (size_t i = 0; i < 21; i++)
@@ -358,7 +358,7 @@ static double relative(float actual, double expected) { // a value around zero: 
 // dense model in double.
 static void test_lazy_adam(gsf_context* ctx) {
     enum { BLOCKS = 33, DRAWN = 3, COUNT = BLOCKS * GSF__BLOCK - 7, STEPS = 1000, WIDE = 48 };
-    gsf__model dense = make_model(ctx, COUNT, 3), lazy = make_model(ctx, COUNT, 3);
+    gsf__model dense = make_small_model(ctx, COUNT, 3), lazy = make_small_model(ctx, COUNT, 3);
     gsf__lazy state;
     const gsf__adam_rates rates = {1e-3, 5e-3, 1e-3, 0.025, 2.5e-3, 1.25e-4};
     gsf__lazy_prepare(ctx->cpu_level, &state, &lazy, &rates, 0, 1);
@@ -442,7 +442,7 @@ static void test_regularisers(gsf_context* ctx) {
     CHECK_NEAR(worst, 0.0, 3e-7);
     CHECK(gsf__exp(-1000.0f) == 0.0f);
 
-    gsf__model model = make_model(ctx, 700, 0);
+    gsf__model model = make_small_model(ctx, 700, 0);
     gsf__penalty_job penalty = {&model, 0.25f, 0.5f};
     gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__penalty_chunk, &penalty);
     for (size_t i = 0; i < 3 * model.count; i += 17) { // derivative of 0.25 exp(s)
@@ -471,7 +471,7 @@ static void test_regularisers(gsf_context* ctx) {
 }
 
 static void test_cap(gsf_context* ctx) { // close to max_splats, only splats with the largest gradients are densified
-    gsf__model model = make_model(ctx, 100, 0);
+    gsf__model model = make_small_model(ctx, 100, 0);
     for (size_t i = 0; i < 100; i++) {
         model.grad_sum[0][i] = (float)((i * 37) % 100);
         model.visits[0][i] = 2;
@@ -501,7 +501,7 @@ static void test_cap(gsf_context* ctx) { // close to max_splats, only splats wit
 // With shared opacities, two new splats are as opaque as the old one, and a split is symmetric along its longest axis.
 static void test_shared(gsf_context* ctx) {
     enum { COUNT = 40 };
-    gsf__model model = make_model(ctx, COUNT, 0), was = make_model(ctx, COUNT, 0);
+    gsf__model model = make_small_model(ctx, COUNT, 0), was = make_small_model(ctx, COUNT, 0);
     gsf__densify_rule rule;
     memset(&rule, 0, sizeof rule);
     rule.grad = 1.0f;
@@ -583,7 +583,7 @@ static void test_mcmc_share(void) {
 // preserved.
 static void test_mcmc_densify(gsf_context* ctx) {
     enum { COUNT = 400, DEAD = 90, BUDGET = 415 };
-    gsf__model model = make_model(ctx, COUNT, 1);
+    gsf__model model = make_small_model(ctx, COUNT, 1);
     float* logits = model.groups[GSF__OPACITY].value;
     double before[COUNT];
     for (size_t i = 0; i < COUNT; i++) {
@@ -642,7 +642,7 @@ static void test_mcmc_densify(gsf_context* ctx) {
 // relocates none of them.
 static void test_mcmc_clamped(gsf_context* ctx) {
     enum { COUNT = 60 };
-    gsf__model model = make_model(ctx, COUNT, 0);
+    gsf__model model = make_small_model(ctx, COUNT, 0);
     float* logits = model.groups[GSF__OPACITY].value;
     for (size_t i = 0; i < COUNT; i++) logits[i] = i == 7 ? -2.0f : -9.0f;
     gsf__densify_rule rule;
@@ -662,7 +662,7 @@ static void test_mcmc_clamped(gsf_context* ctx) {
 // The covariance of the noise is that of the splat times the rate; faint splats get the full noise, opaque ones none.
 static void test_mcmc_noise(gsf_context* ctx) {
     enum { COUNT = 4000 };
-    gsf__model model = make_model(ctx, COUNT, 0);
+    gsf__model model = make_small_model(ctx, COUNT, 0);
     double square[3] = {0, 0, 0};
     for (size_t i = 0; i < COUNT; i++) {
         const float quat[4] = {0.5f, 0.5f, 0.5f, 0.5f}; // axis k of the splat is axis k + 1 of the world
@@ -687,12 +687,12 @@ static void test_mcmc_noise(gsf_context* ctx) {
 
 // ---- a scene to train on -----------------------------------------------------------
 
-typedef struct scene {
+typedef struct small_scene {
     gsf_splats truth, start;
-    gsf_train_view views[VIEWS + 2];  // the last two: restored views, of another size, with weights
-    float* pixels[VIEWS + 2];
+    gsf_train_view views[SCENE_VIEWS + 2];  // the last two: restored views, of another size, with weights
+    float* pixels[SCENE_VIEWS + 2];
     float* weights;
-} scene;
+} small_scene;
 
 // 4 from the origin, facing it.
 static gsf_camera make_camera(double angle, double tilt, int32_t width, int32_t height) {
@@ -761,8 +761,8 @@ static void test_mcmc_render(gsf_context* ctx) {
     gsf_splat_destroy(ctx, &splats);
 }
 
-static scene make_scene(gsf_context* ctx) {
-    scene s;
+static small_scene make_small_scene(gsf_context* ctx) {
+    small_scene s;
     memset(&s, 0, sizeof s);
     uint64_t state = 11;
     CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, &s.truth));
@@ -785,31 +785,31 @@ static scene make_scene(gsf_context* ctx) {
     }
     s.weights = (float*)malloc(40 * 40 * sizeof(float));
     for (int i = 0; i < 40 * 40; i++) s.weights[i] = (float)(i % 11) / 10.0f;
-    for (int v = 0; v < VIEWS + 2; v++) {
+    for (int v = 0; v < SCENE_VIEWS + 2; v++) {
         gsf_train_view* view = &s.views[v];
-        view->camera = v < VIEWS ? make_camera(0.5 * (v - 2), 0.1 * v, WIDTH, HEIGHT)
-                                 : make_camera(1.4, 0.3 * (v - VIEWS), 40, 33 + v - VIEWS);
+        view->camera = v < SCENE_VIEWS ? make_camera(0.5 * (v - 2), 0.1 * v, WIDTH, HEIGHT)
+                                 : make_camera(1.4, 0.3 * (v - SCENE_VIEWS), 40, 33 + v - SCENE_VIEWS);
         s.pixels[v] = (float*)malloc((size_t)(view->camera.width * view->camera.height) * 3 * sizeof(float));
         render_to(ctx, &s.truth, &view->camera, s.pixels[v]);
         view->image = gsf_wrap_image(s.pixels[v], GSF_F32, view->camera.width, view->camera.height, 3);
-        if (v >= VIEWS) view->weight = gsf_wrap_image(s.weights, GSF_F32, 40, view->camera.height, 1);
+        if (v >= SCENE_VIEWS) view->weight = gsf_wrap_image(s.weights, GSF_F32, 40, view->camera.height, 1);
     }
     return s;
 }
 
 // The pixels in the left half are garbage with weight zero: their values change no bit, and the rest is learned as if
 // the photos were smaller. Byte weights give the same result as float weights.
-static void test_masked_training(gsf_context* ctx, const scene* s) {
+static void test_masked_training(gsf_context* ctx, const small_scene* s) {
     enum { PIXELS = WIDTH * HEIGHT };
-    static float photos[VIEWS][3 * PIXELS], shown[3 * PIXELS], weight[PIXELS];
+    static float photos[SCENE_VIEWS][3 * PIXELS], shown[3 * PIXELS], weight[PIXELS];
     static uint8_t bytes[PIXELS];
-    gsf_train_view views[VIEWS];
+    gsf_train_view views[SCENE_VIEWS];
     gsf_splats made[3];
     double error[3] = {0.0};
     for (int i = 0; i < PIXELS; i++) weight[i] = (float)(bytes[i] = i % WIDTH < WIDTH / 2 ? 0 : i % 7 ? 255 : 51) / 255.0f;
     for (int run = 0; run < 3; run++) { // green, noise with weights in floats, green without weights
         uint64_t state = 3;
-        for (int v = 0; v < VIEWS; v++) {
+        for (int v = 0; v < SCENE_VIEWS; v++) {
             views[v] = s->views[v];
             for (int i = 0; i < 3 * PIXELS; i++)
                 photos[v][i] = i / 3 % WIDTH >= WIDTH / 2 ? s->pixels[v][i]
@@ -823,7 +823,7 @@ static void test_masked_training(gsf_context* ctx, const scene* s) {
         desc.iterations = 150;
         desc.depth_smoothness = 0.01f;
         gsf_trainer* trainer;
-        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, VIEWS, &s->start, &trainer))) return;
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, SCENE_VIEWS, &s->start, &trainer))) return;
         for (int i = 0; i < desc.iterations; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL));
         CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &made[run]));
         gsf_splat_destroy_trainer(ctx, trainer);
@@ -843,7 +843,7 @@ static void test_masked_training(gsf_context* ctx, const scene* s) {
 
 // The grey of the photos' mean, by their weights, is the background of trainer, renders and trained splats; of random ones the
 // given colour is.
-static void test_background(gsf_context* ctx, const scene* s) {
+static void test_trainer_background(gsf_context* ctx, const small_scene* s) {
     enum { PIXELS = WIDTH * HEIGHT };
     static float shown[3 * PIXELS], weight[PIXELS];
     static const gsf_background kinds[] = {GSF_BACKGROUND_GIVEN, GSF_BACKGROUND_PHOTOS, GSF_BACKGROUND_RANDOM};
@@ -883,15 +883,15 @@ static void test_background(gsf_context* ctx, const scene* s) {
     }
 }
 
-static void destroy_scene(gsf_context* ctx, scene* s) {
+static void destroy_scene(gsf_context* ctx, small_scene* s) {
     gsf_splat_destroy(ctx, &s->truth);
     gsf_splat_destroy(ctx, &s->start);
     free(s->weights);
-    for (int v = 0; v < VIEWS + 2; v++) free(s->pixels[v]);
+    for (int v = 0; v < SCENE_VIEWS + 2; v++) free(s->pixels[v]);
 }
 
 // Densifies, resets and uses every regulariser within 60 iterations.
-static gsf_train_desc busy_desc(void) {
+static gsf_train_desc make_busy_desc(void) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 60;
@@ -915,18 +915,18 @@ static gsf_train_desc busy_desc(void) {
 }
 
 static gsf_train_desc busy_mcmc_desc(void) { // relocates, grows to its budget and adds noise
-    gsf_train_desc desc = busy_desc();
+    gsf_train_desc desc = make_busy_desc();
     desc.mcmc = 1;
     desc.max_splats = SPLATS + 8;
     desc.prune_opacity = 0.3f;
     return desc;
 }
 
-static gsf_trainer* make_busy(gsf_context* ctx, const scene* s, int mcmc) {
-    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
+static gsf_trainer* make_busy(gsf_context* ctx, const small_scene* s, int mcmc) {
+    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : make_busy_desc();
     gsf_trainer* trainer = NULL;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) exit(2);
-    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer))) exit(2);
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + SCENE_VIEWS, 2));
     gsf_splat_set_restored_weight(trainer, 0.5f);
     return trainer;
 }
@@ -951,29 +951,29 @@ static void take_steps(gsf_context* ctx, gsf_trainer* trainer, int steps) {
 
 // ---- learning ----------------------------------------------------------------------
 
-static double mean_square_error(gsf_context* ctx, gsf_trainer* trainer, const scene* s) {
+static double mean_square_error(gsf_context* ctx, gsf_trainer* trainer, const small_scene* s) {
     double sum = 0.0;
     static float pixels[WIDTH * HEIGHT * 3];
     gsf_render_output out;
     memset(&out, 0, sizeof out);
     out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
-    for (int v = 0; v < VIEWS; v++) {
+    for (int v = 0; v < SCENE_VIEWS; v++) {
         CHECK_OK(ctx, gsf_splat_render_trainer(ctx, trainer, &s->views[v].camera, &out));
         for (int i = 0; i < WIDTH * HEIGHT * 3; i++) {
             const double d = (double)pixels[i] - (double)s->pixels[v][i];
-            sum += d * d / (WIDTH * HEIGHT * 3 * VIEWS);
+            sum += d * d / (WIDTH * HEIGHT * 3 * SCENE_VIEWS);
         }
     }
     return sum;
 }
 
-static void test_learns(gsf_context* ctx, const scene* s) {
+static void test_learns(gsf_context* ctx, const small_scene* s) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 300;
     desc.densify_until = -1;
     gsf_trainer* trainer;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer))) return;
     const double before = mean_square_error(ctx, trainer, s);
     double first = 0.0, last = 0.0;
     for (int i = 0; i < 300; i++) {
@@ -981,12 +981,12 @@ static void test_learns(gsf_context* ctx, const scene* s) {
         if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
         CHECK(stats.iteration == i + 1 && stats.splats == SPLATS && stats.rejected == 0 && stats.restored_loss == 0.0);
         CHECK_NEAR(stats.loss, 0.8 * stats.l1 + 0.2 * (1.0 - stats.ssim), 1e-7);
-        if (i < VIEWS) first += stats.loss;
-        if (i >= 300 - VIEWS) last += stats.loss;
+        if (i < SCENE_VIEWS) first += stats.loss;
+        if (i >= 300 - SCENE_VIEWS) last += stats.loss;
     }
     const double after = mean_square_error(ctx, trainer, s);
-    printf("learning (%s): loss %.4f -> %.4f, %.2f -> %.2f dB\n", gsf_describe_cpu_level(ctx->cpu_level), first / VIEWS,
-           last / VIEWS, -10.0 * log10(before), -10.0 * log10(after));
+    printf("learning (%s): loss %.4f -> %.4f, %.2f -> %.2f dB\n", gsf_describe_cpu_level(ctx->cpu_level), first / SCENE_VIEWS,
+           last / SCENE_VIEWS, -10.0 * log10(before), -10.0 * log10(after));
     CHECK(last < 0.25 * first);
     CHECK(after < before * 0.1); // 10 dB
     gsf_train_stats stats;
@@ -1001,7 +1001,7 @@ static void test_learns(gsf_context* ctx, const scene* s) {
 }
 
 // A third of the splats start where no camera sees them, too faint to learn.
-static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
+static void test_mcmc_learns(gsf_context* ctx, const small_scene* s) {
     enum { BUDGET = SPLATS + 11 };
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
@@ -1014,22 +1014,22 @@ static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     memcpy(start.means, s->start.means, SPLATS * (3 + 3 + 4 + 1 + 12) * sizeof(float)); // one block, see gsf_splat_make
     for (size_t i = 0; i < SPLATS; i += 3) start.opacity_logits[i] = -12.0f;
     gsf_trainer* trainer;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &start, &trainer))) return;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &start, &trainer))) return;
     const double before = mean_square_error(ctx, trainer, s);
     double first = 0.0, last = 0.0;
     for (int i = 0; i < 300; i++) {
         gsf_train_stats stats;
         if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
         CHECK(stats.splats >= SPLATS && stats.splats <= BUDGET && stats.rejected == 0);
-        if (i < VIEWS) first += stats.loss;
-        if (i >= 300 - VIEWS) last += stats.loss;
+        if (i < SCENE_VIEWS) first += stats.loss;
+        if (i >= 300 - SCENE_VIEWS) last += stats.loss;
     }
     const double after = mean_square_error(ctx, trainer, s);
     const gsf_splats* end = gsf_splat_get_trained(trainer);
     size_t faint = 0;
     for (size_t i = 0; i < end->count; i++) faint += end->opacity_logits[i] < -5.0f;
     printf("MCMC (%s): loss %.4f -> %.4f, %.2f -> %.2f dB, %zu faint\n", gsf_describe_cpu_level(ctx->cpu_level),
-           first / VIEWS, last / VIEWS, -10.0 * log10(before), -10.0 * log10(after), faint);
+           first / SCENE_VIEWS, last / SCENE_VIEWS, -10.0 * log10(before), -10.0 * log10(after), faint);
     CHECK(end->count == BUDGET && faint < SPLATS / 12);
     CHECK(last < 0.4 * first);
     CHECK(after < before * 0.2); // 7 dB
@@ -1038,7 +1038,7 @@ static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
 }
 
 // The candidates that are counted before a visit, for which a step reserves memory, are those selected after it.
-static void test_candidates(gsf_context* ctx, const scene* s) {
+static void test_candidates(gsf_context* ctx, const small_scene* s) {
     gsf_trainer* trainer = make_busy(ctx, s, 0);
     gsf__model* model = &trainer->model;
     for (int i = 0; i < 9; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL));
@@ -1069,27 +1069,27 @@ static void test_candidates(gsf_context* ctx, const scene* s) {
 }
 
 // Each photo is used once per permutation; each render counts as one visit.
-static void test_order_and_visits(gsf_context* ctx, const scene* s) {
-    gsf_train_desc desc = busy_desc();
+static void test_order_and_visits(gsf_context* ctx, const small_scene* s) {
+    gsf_train_desc desc = make_busy_desc();
     desc.densify_from = 1000;
     desc.dropout = 0.0f;
     gsf_trainer* trainer;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
-    int seen[4][VIEWS] = {{0}}, differ = 0;
-    for (uint64_t step = 0; step < 4 * VIEWS; step++)
-        seen[step / VIEWS][gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step) - trainer->photos.photos]++;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer))) return;
+    int seen[4][SCENE_VIEWS] = {{0}}, differ = 0;
+    for (uint64_t step = 0; step < 4 * SCENE_VIEWS; step++)
+        seen[step / SCENE_VIEWS][gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step) - trainer->photos.photos]++;
     for (int round = 0; round < 4; round++)
-        for (int v = 0; v < VIEWS; v++) CHECK(seen[round][v] == 1);
-    for (uint64_t step = 0; step < VIEWS; step++)
+        for (int v = 0; v < SCENE_VIEWS; v++) CHECK(seen[round][v] == 1);
+    for (uint64_t step = 0; step < SCENE_VIEWS; step++)
         differ += gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step) !=
-                  gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step + VIEWS);
+                  gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step + SCENE_VIEWS);
     CHECK(differ > 0);
 
     take_steps(ctx, trainer, 3);
     size_t three = 0;
     for (size_t i = 0; i < trainer->model.count; i++) three += trainer->model.visits[0][i] == 3;
     CHECK(three == SPLATS); // all are visible in all cameras
-    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + SCENE_VIEWS, 2));
     gsf_splat_set_restored_weight(trainer, 0.0f);
     take_steps(ctx, trainer, 1);
     gsf_splat_set_restored_weight(trainer, 1.0f);
@@ -1109,14 +1109,14 @@ static void test_order_and_visits(gsf_context* ctx, const scene* s) {
 // The gradient of a restored view is that of the same photo times lambda. The first step's statistic is the norm of the
 // gradient from the backward pass of the same image; without cancellation it is never smaller, and for most splats
 // larger.
-static void test_absolute_statistic(gsf_context* ctx, const scene* s) {
+static void test_absolute_statistic(gsf_context* ctx, const small_scene* s) {
     float sums[2][SPLATS];
     for (int absolute = 0; absolute < 2; absolute++) {
-        gsf_train_desc desc = busy_desc();
+        gsf_train_desc desc = make_busy_desc();
         desc.densify_absolute = absolute;
         desc.dropout = 0.0f;
         gsf_trainer* trainer;
-        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer))) return;
         take_steps(ctx, trainer, 1);
         CHECK(trainer->model.count == SPLATS);
         memcpy(sums[absolute], trainer->model.grad_sum[0], sizeof sums[absolute]);
@@ -1130,7 +1130,7 @@ static void test_absolute_statistic(gsf_context* ctx, const scene* s) {
     CHECK(smaller == 0 && larger > SPLATS / 2);
 }
 
-static void test_restored_gradient(gsf_context* ctx, const scene* s) {
+static void test_restored_gradient(gsf_context* ctx, const small_scene* s) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 10;
@@ -1164,8 +1164,8 @@ static void test_restored_gradient(gsf_context* ctx, const scene* s) {
 
 // Halved photos are means of 2 x 2 pixels by their weights, seen by a camera that projects to half the coordinates; they are
 // trained on up to coarse_until and no longer.
-static void test_coarse(gsf_context* ctx, const scene* s) {
-    gsf_train_desc desc = busy_desc();
+static void test_coarse(gsf_context* ctx, const small_scene* s) {
+    gsf_train_desc desc = make_busy_desc();
     gsf_trainer *coarse, *full;
     gsf_train_stats a, b;
     desc.coarse_until = 2;
@@ -1217,7 +1217,7 @@ static void test_coarse(gsf_context* ctx, const scene* s) {
 }
 
 // The gradient of a sharpness-aware step is the mean of those before and after means are moved by so many pixels up the loss.
-static void test_sharpness(gsf_context* ctx, const scene* s) {
+static void test_sharpness(gsf_context* ctx, const small_scene* s) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 100;
@@ -1261,9 +1261,9 @@ static void test_sharpness(gsf_context* ctx, const scene* s) {
 
 // A negative learning rate means 0: that parameter keeps its values, all others learn. lazy: the SH catch up with rates
 // of 0.
-static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
+static void test_zero_rates(gsf_context* ctx, const small_scene* s, int lazy) {
     for (int rate = 0; rate < 6; rate++) {
-        gsf_train_desc desc = busy_desc();
+        gsf_train_desc desc = make_busy_desc();
         gsf_trainer* trainer;
         desc.densify_until = -1;
         desc.dropout = desc.opacity_decay = 0.0f;
@@ -1271,7 +1271,7 @@ static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
         float* const rates[6] = {&desc.lr_means,   &desc.lr_scales, &desc.lr_quats,
                                  &desc.lr_opacity, &desc.lr_sh_dc,  &desc.lr_sh_rest};
         *rates[rate] = -1.0f;
-        CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
+        CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer));
         const float resolved[6] = {trainer->desc.lr_means,   trainer->desc.lr_scales, trainer->desc.lr_quats,
                                    trainer->desc.lr_opacity, trainer->desc.lr_sh_dc,  trainer->desc.lr_sh_rest};
         for (int k = 0; k < 6; k++) CHECK((resolved[k] == 0.0f) == (k == rate));
@@ -1291,7 +1291,7 @@ static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
 }
 
 // Linear images are encoded as sRGB: known pairs, and a round trip of all 8-bit values.
-static void test_linear_photos(gsf_context* ctx, const scene* s) {
+static void test_linear_photos(gsf_context* ctx, const small_scene* s) {
     enum { N = 3 * WIDTH * HEIGHT };
     static const float known[6][2] = {{0.0f, 0.0f}, {0.002f, 0.02584f}, {0.0031308f, 0.04045f},
                                       {0.2140411f, 0.5f}, {1.0f, 1.0f}, {-0.1f, -1.292f}};
@@ -1320,21 +1320,21 @@ static void test_linear_photos(gsf_context* ctx, const scene* s) {
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, NULL, views, 2, &s->start, &trainer), GSF_ERROR_NUMERIC);
 }
 
-static void test_settings(gsf_context* ctx, const scene* s) {
+static void test_settings(gsf_context* ctx, const small_scene* s) {
     gsf_trainer* trainer;
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
-    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, NULL, s->views, VIEWS, &s->start, &trainer));
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, NULL, s->views, SCENE_VIEWS, &s->start, &trainer));
     CHECK(trainer->desc.iterations == 30000 && trainer->desc.densify_until == 15000 &&
           trainer->desc.densify_from == 500);
     CHECK(trainer->desc.opacity_reset_interval == 3000 && trainer->desc.sh_interval == 1000);
     CHECK(trainer->first_bands == 1 && gsf__trainer_bands(trainer, 999) == 1 &&
           gsf__trainer_bands(trainer, 1000) == 2 && gsf__trainer_bands(trainer, 5000) == 2);
     // five cameras 4 from the origin
-    double centers[VIEWS][3], mean[3] = {0, 0, 0}, extent = 0.0;
-    for (int v = 0; v < VIEWS; v++) gsf_get_camera_center(&s->views[v].camera, centers[v]);
-    for (int v = 0; v < VIEWS; v++) for (int a = 0; a < 3; a++) mean[a] += centers[v][a] / VIEWS;
-    for (int v = 0; v < VIEWS; v++)
+    double centers[SCENE_VIEWS][3], mean[3] = {0, 0, 0}, extent = 0.0;
+    for (int v = 0; v < SCENE_VIEWS; v++) gsf_get_camera_center(&s->views[v].camera, centers[v]);
+    for (int v = 0; v < SCENE_VIEWS; v++) for (int a = 0; a < 3; a++) mean[a] += centers[v][a] / SCENE_VIEWS;
+    for (int v = 0; v < SCENE_VIEWS; v++)
         extent = fmax(extent, 1.1 * sqrt(pow(centers[v][0] - mean[0], 2) + pow(centers[v][1] - mean[1], 2) +
                                          pow(centers[v][2] - mean[2], 2)));
     CHECK_NEAR(trainer->desc.extent, extent, 1e-6);
@@ -1384,7 +1384,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
 
 // ---- determinism ---------------------------------------------------------------------
 
-static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
+static void test_trainer_workers(const small_scene* s, gsf_cpu_level level, int mcmc) {
     gsf_buffer states[3];
     for (int run = 0; run < 3; run++) {
         int workers = run == 1 ? 2 : 5;
@@ -1411,7 +1411,7 @@ static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
 
 // ---- checkpoints -----------------------------------------------------------------------
 
-static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
+static void test_resume(gsf_context* ctx, const small_scene* s, int mcmc) {
     static const int stops[] = {0, 1, 9, 10, 11, 25, 37, 50, 60};
     gsf_trainer* trainer = make_busy(ctx, s, mcmc);
     take_steps(ctx, trainer, 60);
@@ -1423,11 +1423,11 @@ static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
         gsf_buffer state = save_state(ctx, trainer);
         gsf_splat_destroy_trainer(ctx, trainer);
         // the caller provides views and settings again, some before and some after
-        gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
-        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->truth, &trainer))) exit(2);
-        if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+        gsf_train_desc desc = mcmc ? busy_mcmc_desc() : make_busy_desc();
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->truth, &trainer))) exit(2);
+        if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + SCENE_VIEWS, 2));
         CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, trainer, "state", state.data, state.size));
-        if (k % 2 == 0) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+        if (k % 2 == 0) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + SCENE_VIEWS, 2));
         gsf_buffer again = save_state(ctx, trainer);
         CHECK(same_text(&state, &again)); // formatting what was parsed gives the same bytes
         take_steps(ctx, trainer, 60 - stops[k]);
@@ -1441,12 +1441,12 @@ static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
     gsf_destroy_buffer(ctx, &whole);
 }
 
-static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
+static void test_damaged_checkpoints(gsf_context* ctx, const small_scene* s) {
     gsf_splats few = s->start;
     few.count = 2;
-    gsf_train_desc desc = busy_desc();
+    gsf_train_desc desc = make_busy_desc();
     gsf_trainer* trainer;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &few, &trainer))) return;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &few, &trainer))) return;
     take_steps(ctx, trainer, 3);
     gsf_buffer state = save_state(ctx, trainer);
     size_t accepted = 0;
@@ -1507,9 +1507,9 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
 
 // Views so narrow that each sees only part of the splats, which are in spatial order.
 enum { LAZY_STEPS = 300, LAZY_SPLATS = 700 };
-static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int lazy) {
-    gsf_train_view views[VIEWS + 2];
-    for (int v = 0; v < VIEWS + 2; v++) {
+static gsf_trainer* make_narrow(gsf_context* ctx, const small_scene* s, int lazy) {
+    gsf_train_view views[SCENE_VIEWS + 2];
+    for (int v = 0; v < SCENE_VIEWS + 2; v++) {
         views[v] = s->views[v];
         views[v].camera.fx *= 6.0;
         views[v].camera.fy *= 6.0;
@@ -1537,9 +1537,9 @@ static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int lazy) {
         many.quats[4 * i] = 1.0f;
     }
     gsf_trainer* trainer = NULL;
-    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, VIEWS, &many, &trainer))) exit(2);
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, SCENE_VIEWS, &many, &trainer))) exit(2);
     gsf_splat_destroy(ctx, &many);
-    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + VIEWS, 1));
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + SCENE_VIEWS, 1));
     return trainer;
 }
 
@@ -1557,7 +1557,7 @@ static float* export_sh(gsf_context* ctx, const gsf_trainer* trainer, size_t* co
 
 // Lazy training gives the result of dense training. It is bit-identical for any workers, when its state is read in
 // between, and when it resumes from a checkpoint.
-static void test_lazy_training(const scene* s, gsf_cpu_level level) {
+static void test_lazy_training(const small_scene* s, gsf_cpu_level level) {
     int workers = 5;
     gsf_context ctx = open_context(level, NULL), other = open_context(level, &workers);
     gsf_trainer *dense = make_narrow(&ctx, s, 0), *lazy = make_narrow(&ctx, s, 1), *watched = make_narrow(&other, s, 1);
@@ -1639,7 +1639,7 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
 
 // ---- bad input ---------------------------------------------------------------------------
 
-static void test_bad_input(gsf_context* ctx, const scene* s) {
+static void test_bad_input(gsf_context* ctx, const small_scene* s) {
     gsf_trainer* trainer;
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
@@ -1661,11 +1661,11 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     bad = s->views[0];
     bad.image.data = NULL;
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
-    bad = s->views[VIEWS];
+    bad = s->views[SCENE_VIEWS];
     bad.weight.dtype = GSF_U16;
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
     s->weights[7] = -1.0f;
-    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &s->views[VIEWS], 1, &s->start, &trainer), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &s->views[SCENE_VIEWS], 1, &s->start, &trainer), GSF_ERROR_NUMERIC);
     s->weights[7] = 0.7f;
     const float kept = s->pixels[1][5];
     s->pixels[1][5] = NAN;
@@ -1699,7 +1699,7 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
                      GSF_ERROR_INVALID_ARGUMENT);
     desc.render.hidden = NULL;
 
-    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer));
     gsf_buffer before = save_state(ctx, trainer);
     bad = s->views[0];
     bad.image.channels = 4;
@@ -1715,8 +1715,8 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
-static void test_degenerate(gsf_context* ctx, const scene* s) {
-    gsf_train_desc desc = busy_desc();
+static void test_degenerate(gsf_context* ctx, const small_scene* s) {
+    gsf_train_desc desc = make_busy_desc();
     gsf_train_stats stats;
     gsf_trainer* trainer;
     // NaN in splats: left out and counted
@@ -1725,12 +1725,12 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     memcpy(splats.means, s->start.means, SPLATS * 23 * sizeof(float)); // one block
     splats.means[3] = NAN;
     splats.sh[5 * 12 + 7] = INFINITY;
-    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &splats, &trainer));
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &splats, &trainer));
     CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats));
     CHECK(stats.rejected == 2 && stats.splats == SPLATS - 2 && trainer->view.ids[1] == 2);
     gsf_splat_destroy_trainer(ctx, trainer);
     for (int i = 0; i < SPLATS; i++) splats.quats[4 * i] = NAN;
-    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &splats, &trainer), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &splats, &trainer), GSF_ERROR_DEGENERATE);
     gsf_splat_destroy(ctx, &splats);
 
     // huge values stay finite
@@ -1738,7 +1738,7 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     float scales[SPLATS * 3];
     for (int i = 0; i < SPLATS * 3; i++) scales[i] = i % 2 ? 85.0f : -85.0f;
     wild.log_scales = scales;
-    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &wild, &trainer));
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, SCENE_VIEWS, &wild, &trainer));
     take_steps(ctx, trainer, 60);
     int finite = 1;
     for (int g = 0; g < GSF__GROUPS; g++)
@@ -1789,7 +1789,7 @@ static void failing_free(void* user, void* memory) {
 
 // A short run in which allocation `fail_at` fails. The failed step is repeated: the failure must not have changed any
 // state.
-static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* end) {
+static gsf_result run_failing(const small_scene* s, failing* f, int mcmc, gsf_buffer* end) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     ctx.allocator.alloc_fn = failing_alloc;
@@ -1797,16 +1797,16 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* 
     ctx.allocator.user = f;
     ctx.threads = 1;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
+    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : make_busy_desc();
     gsf_trainer* trainer;
     gsf_buffer chunks;
     memset(&chunks, 0, sizeof chunks);
-    gsf_result result = gsf_splat_make_trainer(&ctx, &desc, s->views, VIEWS, &s->start, &trainer), worst = result;
+    gsf_result result = gsf_splat_make_trainer(&ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer), worst = result;
     if (result == GSF_OK) {
-        result = gsf_splat_set_restored_views(&ctx, trainer, s->views + VIEWS, 2);
+        result = gsf_splat_set_restored_views(&ctx, trainer, s->views + SCENE_VIEWS, 2);
         if (result != GSF_OK) {
             worst = result;
-            CHECK_OK(&ctx, gsf_splat_set_restored_views(&ctx, trainer, s->views + VIEWS, 2));
+            CHECK_OK(&ctx, gsf_splat_set_restored_views(&ctx, trainer, s->views + SCENE_VIEWS, 2));
         }
         for (int i = 0; i < 24; i++) {
             result = gsf_splat_step_trainer(&ctx, trainer, NULL);
@@ -1830,7 +1830,7 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* 
     return worst;
 }
 
-static void test_out_of_memory(const scene* s, int mcmc) {
+static void test_trainer_out_of_memory(const small_scene* s, int mcmc) {
     gsf_buffer end;
     memset(&end, 0, sizeof end);
     failing f = {0, 0, 0};
@@ -1849,7 +1849,7 @@ static void test_out_of_memory(const scene* s, int mcmc) {
 }
 
 // Once all photos have been used, steps between densifications do not allocate.
-static void test_steady(const scene* s) {
+static void test_steady(const small_scene* s) {
     failing f = {0, 0, 0};
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
@@ -1863,8 +1863,8 @@ static void test_steady(const scene* s) {
     desc.iterations = 100;
     desc.densify_until = -1;
     gsf_trainer* trainer;
-    if (!CHECK_OK(&ctx, gsf_splat_make_trainer(&ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
-    take_steps(&ctx, trainer, 2 * VIEWS);
+    if (!CHECK_OK(&ctx, gsf_splat_make_trainer(&ctx, &desc, s->views, SCENE_VIEWS, &s->start, &trainer))) return;
+    take_steps(&ctx, trainer, 2 * SCENE_VIEWS);
     const size_t before = f.calls;
     take_steps(&ctx, trainer, 20);
     CHECK(f.calls - before <= 2); // the rasterizer's lists may still grow a little
@@ -1927,7 +1927,7 @@ int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
     test_sort(&ctx);
-    scene s = make_scene(&ctx);
+    small_scene s = make_small_scene(&ctx);
     test_loss_derivative(&ctx);
     for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_SIMD128; level++) test_loss_accuracy((gsf_cpu_level)level);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_loss_weights((gsf_cpu_level)level);
@@ -1952,7 +1952,7 @@ int main(void) {
     test_learns(&ctx, &s);
     test_mcmc_learns(&ctx, &s);
     test_masked_training(&ctx, &s);
-    test_background(&ctx, &s);
+    test_trainer_background(&ctx, &s);
     test_candidates(&ctx, &s);
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
@@ -1962,13 +1962,13 @@ int main(void) {
     test_settings(&ctx, &s);
     test_linear_photos(&ctx, &s);
     for (int lazy = 0; lazy < 2; lazy++) test_zero_rates(&ctx, &s, lazy);
-    for (int mcmc = 0; mcmc < 2; mcmc++) test_workers(&s, ctx.cpu_level, mcmc);
+    for (int mcmc = 0; mcmc < 2; mcmc++) test_trainer_workers(&s, ctx.cpu_level, mcmc);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_lazy_training(&s, (gsf_cpu_level)level);
     for (int mcmc = 0; mcmc < 2; mcmc++) test_resume(&ctx, &s, mcmc);
     test_damaged_checkpoints(&ctx, &s);
     test_bad_input(&ctx, &s);
     test_degenerate(&ctx, &s);
-    for (int mcmc = 0; mcmc < 2; mcmc++) test_out_of_memory(&s, mcmc);
+    for (int mcmc = 0; mcmc < 2; mcmc++) test_trainer_out_of_memory(&s, mcmc);
     test_steady(&s);
     destroy_scene(&ctx, &s);
     return test_report();

@@ -10,7 +10,7 @@ static uint64_t rng = 1;
 
 static double uniform(double lo, double hi) { return test_random_in(&rng, lo, hi); }
 
-static void* take(size_t bytes) { // exact
+static void* allocate(size_t bytes) { // exact
     void* memory = malloc(bytes ? bytes : 1);
     if (!memory) { fprintf(stderr, "out of memory\n"); exit(2); }
     return memory;
@@ -20,11 +20,11 @@ static void* take(size_t bytes) { // exact
 
 enum { CURVE_POINTS = 60 };
 
-typedef struct scene {
+typedef struct curve_scene {
     size_t count;
     gsf_camera cameras[32];
     double points[3 * CURVE_POINTS];
-} scene;
+} curve_scene;
 
 static gsf_camera camera_at(const double pose[16]) {
     gsf_camera camera = {{0}, 500.0, 510.0, 320.0, 230.0, 640, 480};
@@ -33,7 +33,7 @@ static gsf_camera camera_at(const double pose[16]) {
 }
 
 // Views of about unit distance that look near the origin, from an arc or from anywhere, and a flat cloud of points.
-static void make_scene(scene* s, size_t count) {
+static void make_curve_scene(curve_scene* s, size_t count) {
     memset(s, 0, sizeof *s);
     s->count = count;
     const double up[3] = {uniform(-0.3, 0.3), 1.0, uniform(-0.3, 0.3)}, arc = uniform(1.0, 6.0);
@@ -48,7 +48,7 @@ static void make_scene(scene* s, size_t count) {
     for (int i = 0; i < 3 * CURVE_POINTS; i++) s->points[i] = uniform(-1.0, 1.0) * (i % 3 == 1 ? 0.2 : i % 3 ? 0.6 : 1.0);
 }
 
-static void move_scene(const scene* s, double scale, const double offset[3], scene* out) {
+static void move_scene(const curve_scene* s, double scale, const double offset[3], curve_scene* out) {
     *out = *s;
     for (size_t i = 0; i < s->count; i++) {
         double pose[16];
@@ -71,9 +71,9 @@ static path sample(const gsf_camera* cameras, size_t count, const gsf_traj_path_
     memset(&p, 0, sizeof p);
     p.result = gsf_traj_query_path(&ctx, count, desc, &p.layout);
     if (p.result != GSF_OK) return p;
-    p.frames = (gsf_camera*)take(p.layout.frame_count * sizeof(gsf_camera));
-    p.reference = (int32_t*)take(p.layout.frame_count * sizeof(int32_t));
-    void* scratch = take(p.layout.scratch_bytes);
+    p.frames = (gsf_camera*)allocate(p.layout.frame_count * sizeof(gsf_camera));
+    p.reference = (int32_t*)allocate(p.layout.frame_count * sizeof(int32_t));
+    void* scratch = allocate(p.layout.scratch_bytes);
     memset(scratch, 0xff, p.layout.scratch_bytes); // NaN
     memset(p.frames, 0xff, p.layout.frame_count * sizeof(gsf_camera));
     p.result = gsf_traj_sample_path(&ctx, cameras, count, desc, scratch, p.frames, p.reference);
@@ -128,7 +128,7 @@ static double pose_distance(const gsf_camera* a, const gsf_camera* b) { // large
 
 // ---- all sizes -----------------------------------------------------------------
 
-static void check_reference_windows(const scene* s, const path* p, int official) {
+static void check_reference_windows(const curve_scene* s, const path* p, int official) {
     const int32_t length = p->layout.window_length;
     int32_t side, middle;
     gsf__traj_split_window(length, &side, &middle);
@@ -166,8 +166,8 @@ static void check_reference_windows(const scene* s, const path* p, int official)
 static void test_all_sizes(void) {
     for (size_t count = 1; count <= 20; count++)
         for (int32_t length = 2; length <= 100; length++) {
-            scene s;
-            make_scene(&s, count);
+            curve_scene s;
+            make_curve_scene(&s, count);
             gsf_traj_path_desc desc;
             memset(&desc, 0, sizeof desc);
             desc.kind = (gsf_traj_kind)(test_random_bits(&rng) % 4);
@@ -203,8 +203,8 @@ static void test_all_sizes(void) {
 }
 
 static void test_defaults(void) {
-    scene s;
-    make_scene(&s, 6);
+    curve_scene s;
+    make_curve_scene(&s, 6);
     gsf_traj_path_info layout;
     CHECK_OK(&ctx, gsf_traj_query_path(&ctx, 6, NULL, &layout));
     CHECK(layout.window_count == 7 && layout.window_length == 49);
@@ -259,9 +259,9 @@ static void test_defaults(void) {
 
 // ---- paths follow their scene --------------------------------------------------
 
-static void check_following(const scene* s, const gsf_traj_path_desc* base, double scale, const double offset[3],
+static void check_following(const curve_scene* s, const gsf_traj_path_desc* base, double scale, const double offset[3],
                             double tolerance) {
-    static scene moved;
+    static curve_scene moved;
     move_scene(s, scale, offset, &moved);
     gsf_traj_path_desc desc = *base;
     path a = sample(s->cameras, s->count, &desc);
@@ -284,11 +284,11 @@ static void check_following(const scene* s, const gsf_traj_path_desc* base, doub
     drop(&b);
 }
 
-static void test_invariance(void) {
+static void test_traj_invariance(void) {
     const double none[3] = {0.0, 0.0, 0.0}, far_off[3] = {1e6, -1e6, 1e6}, near_by[3] = {30.0, -7.0, 11.0};
     for (int trial = 0; trial < 60; trial++) {
-        scene s;
-        make_scene(&s, 2 + (size_t)trial % 9);
+        curve_scene s;
+        make_curve_scene(&s, 2 + (size_t)trial % 9);
         gsf_traj_path_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.kind = (gsf_traj_kind)(trial % 4);
@@ -304,8 +304,8 @@ static void test_invariance(void) {
         check_following(&s, &desc, 1e3, none, 1e-11);
     }
     for (size_t count = 3; count <= 12; count++) { // an exact ring: all axes and all nearest views are tied
-        scene s;
-        make_scene(&s, count);
+        curve_scene s;
+        make_curve_scene(&s, count);
         for (size_t i = 0; i < count; i++) {
             const double angle = 6.283185307179586 * (double)i / (double)count;
             const double eye[3] = {2.0 * cos(angle), 2.0 * sin(angle), 0.5}, target[3] = {0, 0, 0}, up[3] = {0, 0, 1};
@@ -337,8 +337,8 @@ static double nearest_frame(const path* p, const double at[3]) {
 // an obstacle where there is room.
 static void test_spread(void) {
     for (int trial = 0; trial < 20; trial++) {
-        scene s;
-        make_scene(&s, 2 + (size_t)trial % 9);
+        curve_scene s;
+        make_curve_scene(&s, 2 + (size_t)trial % 9);
         gsf_traj_path_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.kind = GSF_TRAJ_SPREAD;
@@ -398,7 +398,7 @@ static gsf_result result_of(const gsf_camera* cameras, size_t count, gsf_traj_ki
     return result;
 }
 
-static void look(const double eye[3], const double target[3], const double up[3], gsf_camera* out) {
+static void aim_camera(const double eye[3], const double target[3], const double up[3], gsf_camera* out) {
     double pose[16];
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
     *out = camera_at(pose);
@@ -410,7 +410,7 @@ static void test_degenerate_cameras(void) {
     for (int official = 0; official < 2; official++) {
         for (int i = 0; i < 9; i++) { // turned about one point
             const double eye[3] = {1.0, 2.0, 3.0}, target[3] = {cos(0.3 * i), 2.0, sin(0.3 * i)};
-            look(eye, target, up, &c[i]);
+            aim_camera(eye, target, up, &c[i]);
         }
         const gsf_result turned = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
         CHECK(turned == GSF_ERROR_DEGENERATE);
@@ -421,7 +421,7 @@ static void test_degenerate_cameras(void) {
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
         for (int i = 0; i < 9; i++) { // a line of cameras with parallel axes
             const double eye[3] = {(double)i, 0.0, 0.0}, target[3] = {(double)i, 0.0, 5.0};
-            look(eye, target, up, &c[i]);
+            aim_camera(eye, target, up, &c[i]);
         }
         const gsf_result parallel = official ? GSF_ERROR_DEGENERATE : GSF_OK; // the GSFixer release gives no result
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == parallel);
@@ -430,30 +430,30 @@ static void test_degenerate_cameras(void) {
         // a line of cameras with converging axes: the up vector decides on which side the loop runs
         for (int i = 0; i < 9; i++) {
             const double eye[3] = {(double)i - 4.0, 1.0, 0.0}, target[3] = {0.2 * i, 0.5, 5.0};
-            look(eye, target, up, &c[i]);
+            aim_camera(eye, target, up, &c[i]);
         }
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
         for (int i = 0; i < 9; i++) { // a vertical line: nothing determines the side
             const double eye[3] = {0.0, (double)i, 0.0}, target[3] = {0.0, 4.0, 5.0};
-            look(eye, target, up, &c[i]);
+            aim_camera(eye, target, up, &c[i]);
         }
         const gsf_result vertical = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
         CHECK(vertical == GSF_OK || vertical == GSF_ERROR_DEGENERATE);
         for (int i = 0; i < 9; i++) { // looking straight down, like a drone
             const double eye[3] = {(double)(i % 3), 10.0, (double)(i / 3)}, target[3] = {1.0, 0.0, 1.0};
-            look(eye, target, x_axis, &c[i]);
+            aim_camera(eye, target, x_axis, &c[i]);
         }
         const gsf_result drone = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
         CHECK(drone == GSF_OK || drone == GSF_ERROR_DEGENERATE);
         for (int i = 0; i < 2; i++) { // up vectors cancel
             const double eye[3] = {i ? 1.0 : -1.0, 0.0, 0.2}, flipped[3] = {0.0, i ? 1.0 : -1.0, 0.0};
-            look(eye, at_origin, flipped, &c[i]);
+            aim_camera(eye, at_origin, flipped, &c[i]);
         }
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
-        scene s; // exactly upside down, where the GSFixer release mirrors the world
-        make_scene(&s, 6);
+        curve_scene s; // exactly upside down, where the GSFixer release mirrors the world
+        make_curve_scene(&s, 6);
         for (size_t i = 0; i < 6; i++) {
             const double angle = (double)i, eye[3] = {cos(angle), 0.0, sin(angle)}, down[3] = {0.0, -1.0, 0.0};
             const double forward[3] = {-eye[0], 0.0, -eye[2]};
@@ -464,8 +464,8 @@ static void test_degenerate_cameras(void) {
         CHECK(result_of(s.cameras, 6, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         // sizes at which squares overflow: either a path or an error
         for (int power = -150; power <= 150; power += 10) {
-            scene big;
-            make_scene(&s, 5);
+            curve_scene big;
+            make_curve_scene(&s, 5);
             move_scene(&s, pow(10.0, power), at_origin, &big);
             (void)result_of(big.cameras, 5, (gsf_traj_kind)((power + 150) / 10 % 3), official);
         }
@@ -482,7 +482,7 @@ static void check_rig(double wobble, double unit, size_t count, int outlier) {
     for (int i = 0; i < 5; i++) {
         const double eye[3] = {unit * (i - 2.0), 0.1 * unit * (i % 2), 0.0};
         const double target[3] = {eye[0] + unit * wobble * (i % 2 ? 1.0 : -1.0), eye[1], unit};
-        look(eye, target, up, &c[i]);
+        aim_camera(eye, target, up, &c[i]);
     }
     uint64_t state = 5;
     for (int i = 0; i < 3 * 50; i++)
@@ -520,8 +520,8 @@ static void test_parallel_axes(void) {
         }
     gsf_camera pair[2]; // facing each other
     const double up[3] = {0.0, 1.0, 0.0}, left[3] = {-1.0, 0.0, 0.0}, right[3] = {1.0, 0.0, 0.0};
-    look(left, right, up, &pair[0]);
-    look(right, left, up, &pair[1]);
+    aim_camera(left, right, up, &pair[0]);
+    aim_camera(right, left, up, &pair[1]);
     (void)result_of(pair, 2, GSF_TRAJ_REFERENCE, 0);
     CHECK(result_of(pair, 2, GSF_TRAJ_INTERPOLATE, 0) == GSF_OK);
 }
@@ -530,8 +530,8 @@ static void test_parallel_axes(void) {
 // is.
 static void test_outliers(void) {
     for (int trial = 0; trial < 40; trial++) {
-        scene s;
-        make_scene(&s, 3 + (size_t)trial % 7);
+        curve_scene s;
+        make_curve_scene(&s, 3 + (size_t)trial % 7);
         gsf_traj_path_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.kind = trial % 2 ? GSF_TRAJ_ELLIPSE : GSF_TRAJ_REFERENCE;
@@ -626,10 +626,10 @@ static void test_degenerate_primitives(void) {
 
 // ---- NaN anywhere --------------------------------------------------------------
 
-static void test_not_finite(void) {
+static void test_traj_not_finite(void) {
     const double bad_values[3] = {NAN, INFINITY, -INFINITY};
-    scene s;
-    make_scene(&s, 4);
+    curve_scene s;
+    make_curve_scene(&s, 4);
     double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
     for (int kind = 0; kind < 3; kind++)
         for (int v = 0; v < 3; v++) {
@@ -688,8 +688,8 @@ static void test_not_finite(void) {
 }
 
 static void test_not_finite_primitives(void) {
-    scene s;
-    make_scene(&s, 4);
+    curve_scene s;
+    make_curve_scene(&s, 4);
     double poses[64], out[64 * 16], scratch[2048], transform[16], three[3], radius;
     int32_t index;
     for (size_t i = 0; i < 4; i++) gsf_get_camera_c2w(&s.cameras[i], poses + 16 * i);
@@ -816,8 +816,8 @@ static void test_splines(void) {
                 if (i < 40) expected[(size_t)i * dims + d] = sum;
                 else values[(size_t)(i - 40) * dims + d] = sum;
             }
-        double* scratch = (double*)take(gsf__traj_curve_doubles(n, degree, dims) * sizeof(double));
-        double* out = (double*)take(40 * dims * sizeof(double));
+        double* scratch = (double*)allocate(gsf__traj_curve_doubles(n, degree, dims) * sizeof(double));
+        double* out = (double*)allocate(40 * dims * sizeof(double));
         gsf__traj_curve curve;
         CHECK(gsf__traj_make_curve(&curve, sites, values, dims, n, dims, degree, scratch));
         for (size_t i = 0; i < 40; i++) gsf__traj_eval_curve(&curve, at[i], out + i * dims);
@@ -833,23 +833,23 @@ static void test_splines(void) {
     CHECK(gsf__traj_normalize_scratch(4, SIZE_MAX / 4) == SIZE_MAX);
     // spline paths pass through their poses, with scratch memory of exactly the size queried
     for (size_t count = 2; count <= 20; count++) {
-        scene s;
-        make_scene(&s, count);
+        curve_scene s;
+        make_curve_scene(&s, count);
         double poses[32 * 16];
         for (size_t i = 0; i < count; i++) gsf_get_camera_c2w(&s.cameras[i], poses + 16 * i);
         gsf__traj_spline_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.degree = 1 + (int32_t)count % 5;
         desc.frames_per_leg = 7;
-        double* out = (double*)take((count - 1) * 7 * 16 * sizeof(double));
-        void* scratch = take(gsf__traj_spline_path_scratch(count, &desc));
+        double* out = (double*)allocate((count - 1) * 7 * 16 * sizeof(double));
+        void* scratch = allocate(gsf__traj_spline_path_scratch(count, &desc));
         CHECK_OK(&ctx, gsf__traj_spline_path(&ctx, poses, count, &desc, scratch, out));
         test_compare("first pose", out, poses, 16, 1e-12);
         for (size_t i = 0; i < (count - 1) * 7; i++) CHECK(rigidity(out + 16 * i) < 1e-12);
         free(scratch);
         free(out);
-        out = (double*)take(((count - 1) * 5 + 1) * 16 * sizeof(double));
-        scratch = take(gsf__traj_slerp_path_scratch(count));
+        out = (double*)allocate(((count - 1) * 5 + 1) * 16 * sizeof(double));
+        scratch = allocate(gsf__traj_slerp_path_scratch(count));
         CHECK_OK(&ctx, gsf__traj_slerp_path(&ctx, poses, count, (int32_t)(count - 1) * 5 + 1, 0.0, scratch, out));
         for (size_t i = 0; i < count; i++) test_compare("slerp path", out + 80 * i, poses + 16 * i, 16, 1e-10);
         free(scratch);
@@ -875,7 +875,7 @@ static void test_sets_of_views(void) {
             CHECK_OK(&ctx, gsf__traj_nearest_view(&ctx, poses + 16 * i, poses, n, 0.5, &index, NULL));
             CHECK((size_t)index == i);
         }
-        void* scratch = take(gsf__traj_normalize_scratch(n, 0));
+        void* scratch = allocate(gsf__traj_normalize_scratch(n, 0));
         CHECK_OK(&ctx, gsf__traj_normalize(&ctx, poses, n, NULL, 0, NULL, scratch, transform));
         free(scratch);
         gsf__traj_transform_poses(transform, poses, n, out);
@@ -946,13 +946,13 @@ int main(void) {
     test_schedule();
     test_defaults();
     test_all_sizes();
-    test_invariance();
+    test_traj_invariance();
     test_spread();
     test_degenerate_cameras();
     test_parallel_axes();
     test_outliers();
     test_degenerate_primitives();
-    test_not_finite();
+    test_traj_not_finite();
     test_not_finite_primitives();
     return test_report();
 }

@@ -647,7 +647,7 @@ static void pick_views(uint64_t stream, size_t views, size_t count, uint32_t* ch
     }
 }
 
-static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
+static void chunks_backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
     (void)user;
     while (count-- > 0) fn(arg, count, 0);
 }
@@ -699,7 +699,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
         uint8_t* projected = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 1, NULL);
         if (k == 3) {
             const gsf_parallel parallel = ctx.parallel;
-            ctx.parallel.for_fn = backwards; // one worker, the chunks in another order: the same answers
+            ctx.parallel.for_fn = chunks_backwards; // one worker, the chunks in another order: the same answers
             uint8_t* again = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 0, NULL);
             ctx.parallel = parallel;
             CHECK(memcmp(rays, again, n) == 0);

@@ -274,7 +274,7 @@ static inline void train_golden_rates(void) {
     test_tensor delayed = test_get_tensor(&file, "delayed_lr");
     const double scale = strtod(test_metadata(&file, "spatial_lr_scale"), NULL);
     char text[512];
-    snprintf(text, sizeof text, "%s", test_metadata(&file, "delayed"));
+    snprintf(text, sizeof text, "%.511s", test_metadata(&file, "delayed"));
     for (size_t i = 0; i < steps.count; i++) {
         const int32_t step = (int32_t)steps.v[i];
         CHECK_NEAR(gsf__exponential_rate(step, 1.6e-4 * scale, 1.6e-6 * scale, 0, 0.01, 30000), rates.v[i],
