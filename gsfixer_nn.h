@@ -2921,7 +2921,8 @@ static gsf_result gsf__nn_config_read(const gsf__nn_config* config, const gsf__n
 // ---- >>nn vector: additions to the vector vocabulary of >>lanes ----------------------------
 
 // For the rows of a tile, in named variables: gcc would keep an array in memory.
-#define GSF__SIX(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF__FOUR(X) X(0) X(1) X(2) X(3)
+#define GSF__SIX(X) GSF__FOUR(X) X(4) X(5)
 
 #define gsf__v_put GSF__V(gsf__v_put)               // stores; `stream` bypasses the caches and needs an aligned address
 #define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) for each pair of lanes (a, b)
@@ -6116,6 +6117,8 @@ typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last
     // rows repeat the last pixel. Also prefetches GSF__CONV_SHARE k floats from `ahead` on.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
+    // The same for the first eight columns of b; may be NULL.
+    void (*multiply_half)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
     // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
                          int64_t c_next, const float* ahead);
@@ -6187,14 +6190,46 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
     }
 }
 
-// Ten pixels by two panels: 20 registers of sums. That leaves too few registers for ten pointers, so all pixels are
-// addressed from three. The last ten pixels of a row may overlap earlier ones, whose sums are not added again.
+// Ten pixels have too many pointers for the registers, so all are addressed from three. The last ten pixels of a row may
+// overlap earlier ones, whose sums are not added again.
+#define GSF_ROWS(X)                                                         \
+    X(0, a0, 0) X(1, a1, 0) X(2, a1, 1) X(3, a1, 2) X(4, a0, 4) X(5, a1, 4) \
+    X(6, a5, 1) X(7, a5, 2) X(8, a0, 8) X(9, a1, 8)
+
+// Ten pixels by the first eight outputs of a panel, all that the last panel of 3 or 24 outputs has.
+GSF__TARGET_AVX2 static void gsf__conv_multiply_half_avx2(const float* a, int64_t lda, int64_t count, const float* b,
+                                                          int64_t k, float* c, const float* ahead) {
+    const int64_t pitch = lda * (int64_t)sizeof(float);
+    if (count < GSF__CONV_M10) {
+        gsf__conv_multiply_avx2(a, lda, count, b, k, c, ahead);
+        return;
+    }
+    for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
+        const int64_t done = m + GSF__CONV_M10 > count ? m + GSF__CONV_M10 - count : 0;
+        const char *a0 = (const char*)(a + (m - done) * lda), *a1 = a0 + pitch, *a5 = a0 + 5 * pitch;
+        float* to = c + (m - done) * GSF__CONV_N;
+        const float* w = b;
+#define GSF_X(r, base, times) __m256 c##r = _mm256_setzero_ps();
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+        for (int64_t i = 0; i < k; i++, w += GSF__CONV_N, a0 += 4, a1 += 4, a5 += 4) {
+            const __m256 w0 = _mm256_loadu_ps(w);
+#define GSF_X(r, base, times) \
+            c##r = _mm256_fmadd_ps(_mm256_broadcast_ss((const float*)(const void*)(base + times * pitch)), w0, c##r);
+            GSF_ROWS(GSF_X)
+#undef GSF_X
+        }
+#define GSF_X(r, base, times) \
+        if (r >= done) gsf__conv_add8(to + r * GSF__CONV_N, c##r);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+}
+
+// Ten pixels by two panels: 20 registers of sums.
 GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
                                                              int64_t b_next, int64_t k, float* c, int64_t c_next,
                                                              const float* ahead) {
-#define GSF_ROWS(X)                                                                   \
-    X(0, a0, 0) X(1, a1, 0) X(2, a1, 1) X(3, a1, 2) X(4, a0, 4) X(5, a1, 4)           \
-    X(6, a5, 1) X(7, a5, 2) X(8, a0, 8) X(9, a1, 8)
     const int64_t pitch = lda * (int64_t)sizeof(float);
     if (count < GSF__CONV_M10) {
         gsf__conv_multiply_avx2(a, lda, count, b, k, c, ahead);
@@ -6264,11 +6299,13 @@ GSF__TARGET_AVX2 static void gsf__conv_store_avx2(const float* c, int64_t count,
 #endif
 
 static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
-    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, gsf__conv_store_ref, gsf__norm_silu_scalar};
+    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, NULL, gsf__conv_store_ref,
+                                             gsf__norm_silu_scalar};
 #if GSF__X86
-    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, NULL, gsf__conv_store_avx2, gsf__norm_silu_avx2};
-    static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_two_avx512, gsf__conv_store_avx2,
-                                             gsf__norm_silu_avx512};
+    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, gsf__conv_multiply_half_avx2, NULL, gsf__conv_store_avx2,
+                                           gsf__norm_silu_avx2};
+    static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_half_avx2,
+                                             gsf__conv_multiply_two_avx512, gsf__conv_store_avx2, gsf__norm_silu_avx512};
     if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
@@ -6393,9 +6430,11 @@ enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
 // Rows of a segment: pixels (y0 + first ...) x (x0 ...).
 typedef struct gsf__conv_band { int64_t y0, first, rows, x0, columns; } gsf__conv_band;
 
-// tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels of outputs.
-static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, int64_t panels, const float* b, float* tile,
-                          int64_t next) {
+// tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels, which have
+// `outputs`.
+static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, int64_t panels, int64_t outputs,
+                          const float* b, float* tile, int64_t next) {
+    const int half = outputs <= GSF__CONV_N / 2 && job->kernels->multiply_half != NULL;
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
@@ -6408,6 +6447,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, 
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
                     if (panels == 2)
                         job->kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, c, next, ahead);
+                    else if (half) job->kernels->multiply_half(a, job->step, band->columns, b, k, c, ahead);
                     else job->kernels->multiply(a, job->step, band->columns, b, k, c, ahead);
                 }
                 b += k * GSF__CONV_N;
@@ -6444,7 +6484,7 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
             for (int64_t p = 0; p < panels; p++)
                 for (int64_t i = 0; i < band.rows * GSF__CONV_COLUMNS; i++)
                     memcpy(tiles + p * next + i * GSF__CONV_N, b + p * job->panel, GSF__CONV_N * sizeof(float));
-            gsf__conv_sum(job, &band, panels, b + GSF__CONV_N, tiles, next);
+            gsf__conv_sum(job, &band, panels, job->outputs - n0, b + GSF__CONV_N, tiles, next);
             for (int64_t p = 0; p < panels; p++)
                 gsf__conv_store(job, &band, tiles + p * next, n0 + p * GSF__CONV_N, sums[p]);
         }
@@ -18272,13 +18312,55 @@ GSF__V_INLINE void GSF__V(gsf__multiply_tile)(const gsf__grad_product* p, int64_
 #undef GSF_X
 }
 
+// The same for up to 4 rows and more than 2, up to 3 vectors: no lane is wasted on 24 columns of 8, 48 of 16.
+GSF__V_INLINE void GSF__V(gsf__multiply_wide_tile)(const gsf__grad_product* p, int64_t row, int64_t column, size_t left) {
+    const size_t left2 = left - 2 * GSF__LANES;
+    const int64_t last = p->rows - row - 1, step = p->a_step;
+    const float *a = p->a + row * p->a_row, *b = p->b + column;
+    float* c = p->c + row * p->ldc + column;
+#define GSF_X(r)                                            \
+    const float* a##r = a + gsf__least(r, last) * p->a_row; \
+    gsf__vf c##r = gsf__v_set(0.0f), d##r = c##r, e##r = c##r;
+    GSF__FOUR(GSF_X)
+#undef GSF_X
+    for (int64_t k = 0, at = 0; k < p->count; k++, at += step, b += p->ldb) {
+        const gsf__vf b0 = gsf__v_load(b), b1 = gsf__v_load(b + GSF__LANES);
+        const gsf__vf b2 = gsf__v_load_first(b + 2 * GSF__LANES, left2);
+        gsf__vf v;
+#define GSF_X(r)                         \
+        v = gsf__v_set(a##r[at]);        \
+        c##r = gsf__v_madd(v, b0, c##r); \
+        d##r = gsf__v_madd(v, b1, d##r); \
+        e##r = gsf__v_madd(v, b2, e##r);
+        GSF__FOUR(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(r)                                                                                              \
+    if (r <= last) {                                                                                          \
+        float *to = c + (r) * p->ldc, *next = to + GSF__LANES, *third = next + GSF__LANES;                     \
+        gsf__v_store(to, gsf__v_load(to) + c##r);                                                             \
+        gsf__v_store(next, gsf__v_load(next) + d##r);                                                         \
+        gsf__v_store_first(third, gsf__v_load_first(third, left2) + e##r, left2);                             \
+    }
+    GSF__FOUR(GSF_X)
+#undef GSF_X
+}
+
+// Two vectors of columns at a time, three where that leaves none over.
 GSF__V_KERNEL void GSF__V(gsf__multiply)(const gsf__grad_product* p) {
-    for (int64_t j = 0; j < p->columns; j += 2 * GSF__LANES) {
-        const size_t left = (size_t)(p->columns - j);
-        for (int64_t r = 0; r < p->rows; r += 6) {
+    for (int64_t j = 0; j < p->columns;) {
+        const size_t left = (size_t)(p->columns - j), vectors = (left + GSF__LANES - 1) / GSF__LANES;
+        if (vectors > 1 && vectors % 2) {
+            for (int64_t r = 0; r < p->rows; r += 4)
+                if (left >= 3 * GSF__LANES) GSF__V(gsf__multiply_wide_tile)(p, r, j, 3 * GSF__LANES);
+                else GSF__V(gsf__multiply_wide_tile)(p, r, j, left);
+            j += 3 * GSF__LANES;
+            continue;
+        }
+        for (int64_t r = 0; r < p->rows; r += 6)
             if (left >= 2 * GSF__LANES) GSF__V(gsf__multiply_tile)(p, r, j, 2 * GSF__LANES);
             else GSF__V(gsf__multiply_tile)(p, r, j, left);
-        }
+        j += 2 * GSF__LANES;
     }
 }
 

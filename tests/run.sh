@@ -127,6 +127,7 @@ build_trees
 # end of its output as long as any other test ran.
 if [ -d "$build/windows" ]; then
     wineserver=$(command -v wineserver || ls /usr/lib/wine/wineserver64)
+    mkdir -p "$WINEPREFIX"
     "$wineserver" -p
     trap '"$wineserver" -k' EXIT
     step wine "$root/tests/cross/wine.sh" cmd /c exit
