@@ -6117,7 +6117,7 @@ typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last
     // rows repeat the last pixel. Also prefetches GSF__CONV_SHARE k floats from `ahead` on.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
-    // The same for the first eight columns of b; may be NULL.
+    // The same for the first eight columns of b; the others may be left out, and the prefetches.
     void (*multiply_half)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
     // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
@@ -6299,7 +6299,7 @@ GSF__TARGET_AVX2 static void gsf__conv_store_avx2(const float* c, int64_t count,
 #endif
 
 static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
-    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, NULL, gsf__conv_store_ref,
+    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, gsf__conv_multiply_ref, NULL, gsf__conv_store_ref,
                                              gsf__norm_silu_scalar};
 #if GSF__X86
     static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, gsf__conv_multiply_half_avx2, NULL, gsf__conv_store_avx2,
@@ -6430,11 +6430,11 @@ enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
 // Rows of a segment: pixels (y0 + first ...) x (x0 ...).
 typedef struct gsf__conv_band { int64_t y0, first, rows, x0, columns; } gsf__conv_band;
 
-// tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels, which have
-// `outputs`.
+// tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels, which are to
+// give `outputs`.
 static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, int64_t panels, int64_t outputs,
                           const float* b, float* tile, int64_t next) {
-    const int half = outputs <= GSF__CONV_N / 2 && job->kernels->multiply_half != NULL;
+    const gsf__conv_kernels* kernels = job->kernels;
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
@@ -6445,10 +6445,9 @@ static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, 
                     const float* a = job->in[kt] + y * job->in_stride + job->origin + band->x0 * job->step + k0;
                     const float* ahead = b + (GSF__CONV_N + row * GSF__CONV_SHARE) * k; // the rows share the prefetching
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
-                    if (panels == 2)
-                        job->kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, c, next, ahead);
-                    else if (half) job->kernels->multiply_half(a, job->step, band->columns, b, k, c, ahead);
-                    else job->kernels->multiply(a, job->step, band->columns, b, k, c, ahead);
+                    if (panels == 2) kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, c, next, ahead);
+                    else if (outputs > GSF__CONV_N / 2) kernels->multiply(a, job->step, band->columns, b, k, c, ahead);
+                    else kernels->multiply_half(a, job->step, band->columns, b, k, c, ahead);
                 }
                 b += k * GSF__CONV_N;
             }
@@ -18335,18 +18334,18 @@ GSF__V_INLINE void GSF__V(gsf__multiply_wide_tile)(const gsf__grad_product* p, i
         GSF__FOUR(GSF_X)
 #undef GSF_X
     }
-#define GSF_X(r)                                                                                              \
-    if (r <= last) {                                                                                          \
-        float *to = c + (r) * p->ldc, *next = to + GSF__LANES, *third = next + GSF__LANES;                     \
-        gsf__v_store(to, gsf__v_load(to) + c##r);                                                             \
-        gsf__v_store(next, gsf__v_load(next) + d##r);                                                         \
-        gsf__v_store_first(third, gsf__v_load_first(third, left2) + e##r, left2);                             \
+#define GSF_X(r)                                                                                       \
+    if (r <= last) {                                                                                   \
+        float *to = c + (r) * p->ldc, *next = to + GSF__LANES, *third = next + GSF__LANES;             \
+        gsf__v_store(to, gsf__v_load(to) + c##r);                                                      \
+        gsf__v_store(next, gsf__v_load(next) + d##r);                                                  \
+        gsf__v_store_first(third, gsf__v_load_first(third, left2) + e##r, left2);                      \
     }
     GSF__FOUR(GSF_X)
 #undef GSF_X
 }
 
-// Two vectors of columns at a time, three where that leaves none over.
+// Two vectors of columns at a time, three where their number is odd.
 GSF__V_KERNEL void GSF__V(gsf__multiply)(const gsf__grad_product* p) {
     for (int64_t j = 0; j < p->columns;) {
         const size_t left = (size_t)(p->columns - j), vectors = (left + GSF__LANES - 1) / GSF__LANES;
@@ -18355,12 +18354,12 @@ GSF__V_KERNEL void GSF__V(gsf__multiply)(const gsf__grad_product* p) {
                 if (left >= 3 * GSF__LANES) GSF__V(gsf__multiply_wide_tile)(p, r, j, 3 * GSF__LANES);
                 else GSF__V(gsf__multiply_wide_tile)(p, r, j, left);
             j += 3 * GSF__LANES;
-            continue;
+        } else {
+            for (int64_t r = 0; r < p->rows; r += 6)
+                if (left >= 2 * GSF__LANES) GSF__V(gsf__multiply_tile)(p, r, j, 2 * GSF__LANES);
+                else GSF__V(gsf__multiply_tile)(p, r, j, left);
+            j += 2 * GSF__LANES;
         }
-        for (int64_t r = 0; r < p->rows; r += 6)
-            if (left >= 2 * GSF__LANES) GSF__V(gsf__multiply_tile)(p, r, j, 2 * GSF__LANES);
-            else GSF__V(gsf__multiply_tile)(p, r, j, left);
-        j += 2 * GSF__LANES;
     }
 }
 

@@ -409,7 +409,7 @@ static void test_out_of_memory_and_cancel(void) {
     small.allocator.user = &h;
     CHECK_OK(&small, gsf_init_context(&small));
     size_t last = 0;
-    for (size_t k = 1; k < 1000; k += (size_t)test_few(1, 3)) {
+    for (size_t k = 1; k < 1000; k++) {
         h.calls = 0;
         h.fail_at = k;
         const gsf_result result = gsf_splat_make_dense(&small, &s.scene, all_views, VIEWS, NULL, &desc, &dense, NULL);

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# headers.sh COMPILER STANDARD: every header alone, in every order (clang), declared and implemented, and every configuration
-# compiles without a warning. Syntax only.
+# headers.sh COMPILER STANDARD: every header alone, in every order (gcc: C, clang: C++), declared and implemented, and every
+# configuration compiles without a warning. Syntax only.
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
 unit() { # NAME FLAG... ; the unit's text on stdin
@@ -26,41 +26,40 @@ include_all() { for header in "$@"; do echo "#include \"$header.h\""; done; }
 for header in "${headers[@]}"; do
     include_all "$header" | unit "$header"
     { echo "#define $(implementation_of "$header")"; include_all "$header"; } | unit "$header, own implementation"
+    { include_all "$header"; echo "#define GSFIXER_IMPLEMENTATION"; include_all "$header" "$header"; } |
+        unit "$header declared, then implemented, then included again"
     for other in "${headers[@]}"; do
         [ "$other" = "$header" ] || include_all "$header" "$other" | unit "$header, $other"
     done
 done
-# What depends on the order, or on what was included before, does so for every compiler: clang, which is faster, tries it in both
-# languages. Every module begins with gsfixer.h, so that its place among them makes no other text.
+# What depends on the order does so for every compiler: each language is tried by one. Every module begins with gsfixer.h, so
+# that its place among them makes no other text.
 modules=()
 for header in "${headers[@]}"; do
     [ "$header" = gsfixer ] && continue
     modules+=("$header")
     [ "$(grep -m 1 '^#include "' "$root/$header.h")" = '#include "gsfixer.h"' ] || { echo "$header: not gsfixer.h first"; exit 1; }
 done
-orders="${modules[*]}"
-if [ "$compiler" = clang ]; then
-    orders=$(permutations "" "${modules[@]}")
-    for header in "${headers[@]}"; do
-        { include_all "$header"; echo "#define GSFIXER_IMPLEMENTATION"; include_all "$header" "$header"; } |
-            unit "$header declared, then implemented, then included again"
-    done
-fi
+case $compiler:$standard in
+    gcc:c11 | clang:c++17) orders=$(permutations "" "${modules[@]}") ;;
+    *) orders="${modules[*]}" ;;
+esac
 while read -r order; do
     # shellcheck disable=SC2086
     { echo "#define GSFIXER_IMPLEMENTATION"; include_all $order; } | unit "implementation in order: $order"
 done <<< "$orders"
 
 whole() { echo "#define GSFIXER_IMPLEMENTATION"; include_all "${headers[@]}"; }
-whole | unit "NDEBUG, GSFIXER_STATIC" -DNDEBUG -DGSFIXER_STATIC
+whole | unit "NDEBUG" -DNDEBUG
 whole | unit "GSF_NO_SIMD" -DGSF_NO_SIMD
 whole | unit "GSF_NO_AVX512" -DGSF_NO_AVX512
 whole | unit "GSF_NO_STB" -DGSF_NO_STB
-more=(-DGSF_NN_TRAINING) # what adds code
-if [ "$compiler" = gcc ] || have_include omp.h; then more+=(-fopenmp); fi
-if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then more+=(-DGSF_USE_EMBREE); fi
-if have_include zstd.h; then more+=(-DGSF_USE_ZSTD); fi
-whole | unit "${more[*]}" "${more[@]}"
+whole | unit "GSFIXER_STATIC" -DGSFIXER_STATIC
+whole | unit "GSF_NN_TRAINING" -DGSF_NN_TRAINING
+if [ "$compiler" = gcc ] || have_include omp.h; then whole | unit "OpenMP" -fopenmp; fi
+if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then
+    whole | unit "GSF_USE_EMBREE" -DGSF_USE_EMBREE
+fi
 if [ "$ext" = cpp ]; then
     if have_include glm/glm.hpp; then
         whole | unit "GSF_USE_GLM" -DGSF_USE_GLM

@@ -11,8 +11,8 @@ link() { # NAME SOURCE...: compiles by extension, unless that was done before, l
         objects+=("$work/$source.o")
         [ ! -e "$work/$source.o" ] || continue
         case $source in
-            *.c) "$c_compiler" -std=c11 $simd -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
-            *.cpp) "$cxx" -std=c++17 $simd -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
+            *.c) "$c_compiler" -std=c11 -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
+            *.cpp) "$cxx" -std=c++17 -I"$root" -c "$work/$source" -o "$work/$source.o" ;;
         esac > "$work/log" 2>&1 || { failed "$name ($source)" "$work/log"; return; }
     done
     "$cxx" "${objects[@]}" -o "$work/program" -lm > "$work/log" 2>&1 || { failed "$name" "$work/log"; return; }
@@ -23,7 +23,6 @@ case $compiler in
     clang) c_compiler=${cc/++/} cxx=${c_compiler/clang/clang++} ;;
 esac
 other=$([ "$ext" = c ] && echo cpp || echo c)
-simd=
 
 # A caller that uses something of the ground and of a module.
 cat > "$work/caller.$other" <<'TEXT'
@@ -45,7 +44,6 @@ for header in "${headers[@]}"; do
     parts+=("$header.$ext")
 done
 link "one translation unit per module" "${parts[@]}" "caller.$other"
-simd=-DGSF_NO_SIMD # the kernels' names were tried: half as much to compile
 
 { echo "#define GSFIXER_IMPLEMENTATION"; printf '#include "%s.h"\n' "${headers[@]}"; } > "$work/whole.$ext"
 link "the two-line file" "whole.$ext" "caller.$other"
