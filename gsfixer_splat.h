@@ -44,7 +44,7 @@
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
        gsf_splat_load_train_views(&ctx, &scene, NULL, scene.view_count, &views);         // photos
        gsf_splat_make_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL);   // points -> splats
-       desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_BALANCED);
+       desc = gsf_splat_resolve_few_view_desc(&scene, scene.view_count, GSF_QUALITY_BALANCED);
        gsf_splat_make_warp(&ctx, &warp);                                                 // or your own gsf_restorer
        gsf_splat_make_fixer(&ctx, &desc, views, scene.view_count, &start, &warp, &fixer);
        while (stats.stage != GSF_FIX_DONE) gsf_splat_step_fixer(&ctx, fixer, &stats);    // train, plan, restore
@@ -711,7 +711,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_load_train_views(gsf_context* ctx, gs
                                                             size_t view_count, gsf_train_view** out);
 
 typedef enum gsf_initial_kind { // which points become splats
-    GSF_INITIAL_AUTO = 0,  // RANDOM for a scene without points, BOTH for up to 5 views, DENSE for more
+    GSF_INITIAL_AUTO = 0,  // RANDOM for a scene without points, BOTH for a single view, else DENSE
     GSF_INITIAL_BOTH,      // points of the scene that a view sees, by track or by ray
     GSF_INITIAL_TRACKS,    // points whose track contains a view: the start used in the papers
     GSF_INITIAL_RAYS,      // points that a ray from a view reaches
@@ -748,10 +748,11 @@ typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
     GSF_QUALITY_FAST,         // lazy_adam; windows are skipped from 36 dB on, frames restored at 320 x 240 pixels
 } gsf_quality;
 
-// The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness),
-// the settings of `quality`, and from the scene (NULL = none) the near plane for all its cameras and the points that
-// determine the axes of the path, which are borrowed.
-GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf_quality quality);
+// The loop's settings for few photos: 1200 iterations, regularisers (train.depth_smoothness; dropout and opacity_decay, which
+// are twice as strong for up to 3 photos as for 6 or more, in between in inverse proportion to view_count), the settings of
+// `quality`, and from the scene (NULL = none) the near plane for all its cameras and the points that determine the axes of
+// the path, which are borrowed.
+GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, size_t view_count, gsf_quality quality);
 
 // Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Use
 // the same near plane for training and rendering.
@@ -14549,16 +14550,14 @@ GSF_API gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene
     return GSF_OK;
 }
 
-enum { GSF__DENSE_FROM_VIEWS = 6, GSF__STREAM_POINTS = 0x72616e64 }; // differs from the trainer's streams
+enum { GSF__STREAM_POINTS = 0x72616e64 }; // differs from the trainer's streams
 
 static gsf_initial_desc gsf__initial_desc_defaults(const gsf_initial_desc* desc, const gsf_scene* scene, size_t view_count) {
     gsf_initial_desc d;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     if (d.kind == GSF_INITIAL_AUTO)
-        d.kind = scene->point_count == 0               ? GSF_INITIAL_RANDOM
-                 : view_count < GSF__DENSE_FROM_VIEWS ? GSF_INITIAL_BOTH
-                                                      : GSF_INITIAL_DENSE;
+        d.kind = !scene->point_count ? GSF_INITIAL_RANDOM : view_count < 2 ? GSF_INITIAL_BOTH : GSF_INITIAL_DENSE;
     d.sh_degree = d.sh_degree == 0 ? 3 : d.sh_degree < 0 ? 0 : d.sh_degree;
     if (d.random_points == 0) d.random_points = 20000;
     d.visibility.method = d.kind == GSF_INITIAL_RAYS     ? GSF_VISIBILITY_RAYS
@@ -14725,12 +14724,13 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
     return near_plane > 1e-6 && near_plane < 0.2 ? (float)near_plane : 0.2f;
 }
 
-GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf_quality quality) {
+GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, size_t view_count, gsf_quality quality) {
+    const float strength = view_count <= 3 ? 2.0f : view_count < 6 ? 6.0f / (float)view_count : 1.0f;
     gsf_fix_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.train.iterations = 1200;
-    desc.train.dropout = 0.1f;
-    desc.train.opacity_decay = 0.002f;
+    desc.train.dropout = 0.1f * strength;
+    desc.train.opacity_decay = 0.002f * strength;
     desc.train.depth_smoothness = 0.5f;
     desc.train.background_kind = GSF_BACKGROUND_PHOTOS;
     desc.train.lazy_adam = quality == GSF_QUALITY_FAST;

@@ -90,7 +90,7 @@ int main(int argc, char** argv) {
     gsf_camera camera = {};
     std::filesystem::file_time_type seen = {};
     if (!r && views.empty()) r = gsf_fail(&engine, GSF_ERROR_NOT_FOUND, "%s: no photo0.exr", folder.c_str());
-    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_FAST);
+    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(NULL, views.size(), GSF_QUALITY_FAST);
     if (!r) desc.train.render.near_plane = gsf_splat_measure_near_plane(&views[0].camera, sizeof views[0], views.size());
     if (!r) r = gsf_splat_load(&engine, (folder + "/start.ply").c_str(), &splats);
     if (!r) r = gsf_splat_make_warp(&engine, &warp);

@@ -122,9 +122,9 @@ static const option_spec option_specs[] = {
      "camera path of the frames to repair (default reference)"},
     {"--iterations", WHOLE, AT(iterations), 1, 1e7, "N", "fix view evaluate", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
-     "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
-     "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
-     "photos (dense, the default with 6 photos or more); random points (random, the default if the scene has no points)"},
+     "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both); all points\n"
+     "(all); those of both plus points of multi-view stereo between the training photos (dense, the default from two photos\n"
+     "on); random points (random, the default if the scene has no points)"},
     {"--iterations", WHOLE, AT(iterations), 1, 1e7, "N", "dataset", "training steps for the reference views (default 1200)"},
     {"--clean-iterations", WHOLE, AT(clean_iterations), 1, 1e7, "N", "dataset",
      "training steps for the splats that are perturbed (default 3000)"},
@@ -957,9 +957,9 @@ typedef struct render_filter {
 
 static gsf_result open_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats* splats, const gsf_render_desc* desc,
                               render_filter* f) {
-    gsf_fix_desc fix = gsf_splat_resolve_few_view_desc(scene, GSF_QUALITY_BALANCED);
     int present;
     gsf_result result = gsfix_split_scene(app, scene, &f->split);
+    gsf_fix_desc fix = gsf_splat_resolve_few_view_desc(scene, f->split.train_count, GSF_QUALITY_BALANCED);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &f->restorer, &present);
     if (result == GSF_OK)
         result = gsf_splat_load_train_views(&app->ctx, scene, f->split.train, f->split.train_count, &f->views);

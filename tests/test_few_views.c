@@ -87,9 +87,9 @@ static void test_kinds(gsf_context* ctx, const host* h) {
     CHECK(count_kind(ctx, h, GSF_INITIAL_DENSE, 3, &stats) > both.scene_points);
     CHECK(stats.scene_points == both.scene_points && stats.dense.pairs > 0 && stats.new_points <= 40000);
     // the kind that GSF_INITIAL_AUTO selects
-    count_kind(ctx, h, GSF_INITIAL_AUTO, 5, &stats);
+    count_kind(ctx, h, GSF_INITIAL_AUTO, 1, &stats);
     CHECK(stats.used.kind == GSF_INITIAL_BOTH);
-    count_kind(ctx, h, GSF_INITIAL_AUTO, 6, &stats);
+    count_kind(ctx, h, GSF_INITIAL_AUTO, 2, &stats);
     CHECK(stats.used.kind == GSF_INITIAL_DENSE);
     host empty = *h;
     empty.scene.point_count = 0;
@@ -189,15 +189,19 @@ static void test_memory(const host* h) {
 }
 
 static void test_settings(gsf_context* ctx, host* h) {
-    const gsf_fix_desc alone = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_BALANCED);
+    const gsf_fix_desc alone = gsf_splat_resolve_few_view_desc(NULL, 6, GSF_QUALITY_BALANCED);
+    const gsf_fix_desc three = gsf_splat_resolve_few_view_desc(NULL, 3, GSF_QUALITY_BALANCED);
+    const gsf_fix_desc four = gsf_splat_resolve_few_view_desc(NULL, 4, GSF_QUALITY_BALANCED);
+    CHECK(three.train.dropout == 0.2f && three.train.opacity_decay == 0.004f);
+    CHECK(four.train.dropout == 0.1f * 1.5f && four.train.opacity_decay == 0.002f * 1.5f);
     CHECK(alone.train.iterations == 1200 && alone.train.dropout == 0.1f && alone.train.opacity_decay == 0.002f);
     CHECK(alone.train.depth_smoothness == 0.5f && alone.skip_psnr == 45.0f && !alone.train.lazy_adam);
     CHECK(alone.train.background_kind == GSF_BACKGROUND_PHOTOS);
     CHECK(!alone.points && alone.train.render.near_plane == 0.0f);
-    const gsf_fix_desc fast = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_FAST);
+    const gsf_fix_desc fast = gsf_splat_resolve_few_view_desc(NULL, 6, GSF_QUALITY_FAST);
     CHECK(fast.skip_psnr == 36.0f && fast.max_pixels == 320 * 240 && fast.train.lazy_adam);
-    CHECK(gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_EXACT).skip_psnr == 0.0f);
-    const gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&h->scene, GSF_QUALITY_BALANCED);
+    CHECK(gsf_splat_resolve_few_view_desc(NULL, 6, GSF_QUALITY_EXACT).skip_psnr == 0.0f);
+    const gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&h->scene, 6, GSF_QUALITY_BALANCED);
     CHECK(desc.points == h->points && desc.point_count == POINTS);
     CHECK_NEAR(desc.train.render.near_plane, 0.011 * 0.9, 1e-4); // the outer cameras are 0.9 from the middle
     gsf_camera far_apart[2] = {h->views[0].camera, h->views[0].camera};

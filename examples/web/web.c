@@ -270,7 +270,7 @@ static gsf_result web_open_scene(int width, int height, int photos, int repair, 
     if (result != GSF_OK) return result;
     orbit_set_up(&w.at, w.views, w.train_count);
     orbit_from(&w.at, &w.views[0].camera, width, height);
-    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&w.scene, GSF_QUALITY_FAST);
+    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&w.scene, w.train_count, GSF_QUALITY_FAST);
     if (iterations > 0) desc.train.iterations = iterations;
     w.iterations = desc.train.iterations;
     w.desc = desc.train.render;
