@@ -195,6 +195,7 @@ typedef struct fix_run {
     gsf_camera* path; // from --path, or NULL
     size_t path_count;
     gsf_splats initial;
+    gsf_initial_stats initial_stats;
     gsf_restorer restorer;
     int has_restorer;
     int comparing; // set during the run without repair, the first one of --compare
@@ -226,20 +227,25 @@ static void add_seconds(fix_run* run, int stage, double* since) {
 // ---- initial splats --------------------------------------------------------------
 
 static gsf_result make_initial(fix_run* run) {
-    gsf_initial_stats stats;
+    gsf_initial_stats* stats = &run->initial_stats;
     const gsf_result result = gsf_splat_make_initial_splats(run->ctx, &run->scene, run->split.train,
-                                                            run->split.train_count, &run->setup.initial, &run->initial,
-                                                            &stats);
+                                                            run->split.train_count, &run->setup.initial, &run->initial, stats);
     if (result != GSF_OK) return result;
-    run->setup.initial = stats.used;
-    const gsf_initial_kind kind = stats.used.kind;
+    run->setup.initial = stats->used;
+    const gsf_initial_kind kind = stats->used.kind;
     const int traced = kind == GSF_INITIAL_BOTH || kind == GSF_INITIAL_RAYS || kind == GSF_INITIAL_DENSE;
-    run->rays = !traced || !run->scene.point_count ? "none" : stats.visibility.used_embree ? "embree" : "z-buffer";
-    if (kind == GSF_INITIAL_DENSE)
-        gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s",
-                   stats.scene_points, stats.new_points, stats.dense.pairs,
-                   stats.dense.seconds_prepare + stats.dense.seconds_match + stats.dense.seconds_fuse);
+    run->rays = !traced || !run->scene.point_count ? "none" : stats->visibility.used_embree ? "embree" : "z-buffer";
     return GSF_OK;
+}
+
+static void tell_start(const fix_run* run) {
+    const gsf_initial_stats* stats = &run->initial_stats;
+    if (stats->used.kind == GSF_INITIAL_DENSE)
+        gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s",
+                   stats->scene_points, stats->new_points, stats->dense.pairs,
+                   stats->dense.seconds_prepare + stats->dense.seconds_match + stats->dense.seconds_fuse);
+    gsfix_note(run->app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count,
+               run->split.test_count, run->initial.count, run->resuming ? "; going on from the checkpoint" : "");
 }
 
 // ---- held-out views --------------------------------------------------------------
@@ -903,9 +909,7 @@ static gsf_result prepare(fix_run* run) {
     else result = gsfix_remove_output(app, "checkpoint");
     if (result == GSF_OK && !run->resuming && run->comparing) result = start_fixer(run);
     if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
-    if (result == GSF_OK)
-        gsfix_note(app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count,
-                   run->split.test_count, run->initial.count, run->resuming ? "; going on from the checkpoint" : "");
+    if (result == GSF_OK) tell_start(run);
     return result;
 }
 

@@ -100,7 +100,7 @@ cmp stdout a/metrics.json || fail "--json and metrics.json differ"
 for key in psnr ssim per_view seconds total init train render restore distill iterations splats peak_rss_bytes seed threads isa \
     switches version command; do holds "\"$key\":" a/metrics.json; done
 for value in '"rounds":1' '"windows":1' '"window_frames":4' '"lambda":1' '"first_round":[1-9][0-9]*' '"densify_interval":100' \
-    '"lr_means":0.00016' '"lambda_ssim":0.2' '"dropout":0.1' '"trajectory":"reference"' '"antialiased":"off"'; do
+    '"lr_means":0.00016' '"lambda_ssim":0.2' '"dropout":0.2' '"trajectory":"reference"' '"antialiased":"off"'; do
     holds "\"switches\":.*$value[,}]" a/metrics.json # the settings in effect, with defaults filled in
 done
 for file in splats.ply report.html checkpoint fixed/round1_window1_00001.png; do [ -s a/$file ] || fail "no a/$file"; done
