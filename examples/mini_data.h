@@ -202,7 +202,7 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
     p->photos = count;
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &scene, train, count, &views);
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
-    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, (size_t)count, GSF_QUALITY_EXACT);
+    gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, count, GSF_QUALITY_EXACT);
     desc.trajectory = seed / 16 % 2 ? GSF_TRAJ_REFERENCE : GSF_TRAJ_SPREAD; // frames far from the photos, and near them
     desc.train.iterations = d->fit + 101;
     desc.train.seed = seed;
