@@ -1740,6 +1740,9 @@ GSF__SHARED float gsf__exp2_f32(float x) {
        }
        #endif
 
+   An inclusion takes the preprocessor through the whole file once per instruction set, so sections that are far apart share
+   one where the types that they need allow it: gcc slows down once a unit has passed it more than 300,000 lines.
+
    Types       gsf__vf  GSF__LANES floats      gsf__vi  GSF__LANES int32_t     gsf__vm  mask, one bool per lane
                gsf__vd  GSF__LANES / GSF__HALVES doubles
    Names       gsf__v_ operates on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the other types. + - * / work on gsf__vf and

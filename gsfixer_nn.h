@@ -3108,19 +3108,8 @@ GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may re
     (void)stream;
 }
 
-#define gsf__v_gelu_tail GSF__V(gsf__v_gelu_tail)
-#define gsf__v_gelu_limit GSF__V(gsf__v_gelu_limit)
-#define gsf__v_gelu GSF__V(gsf__v_gelu)
-#define gsf__v_activate GSF__V(gsf__v_activate)
-
-#define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_ACTIVATIONS
-#define GSF__KERNELS_AVX512
-#include "gsfixer.h" // compiles what follows, once per instruction set
-#undef GSF__KERNELS_ACTIVATIONS
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_ACTIVATIONS
+#ifdef GSF__KERNELS_NN
 #if GSF__LANES > 1 // at one lane: the reference above
 
 // q of gsf__nn_gelu_ref for z in [0, 13.2]; power: exp(-z^2/2)
@@ -3229,20 +3218,10 @@ GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float sca
 }
 
 #endif
-#endif // GSF__KERNELS_ACTIVATIONS
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
-static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level) {
-    static const gsf__activation_kernels scalar = {gsf__activate_scalar, gsf__softmax_scalar};
-#if GSF__X86
-    static const gsf__activation_kernels avx2 = {gsf__activate_avx2, gsf__softmax_avx2};
-    static const gsf__activation_kernels avx512 = {gsf__activate_avx512, gsf__softmax_avx512};
-    if (GSF__REACHES(level, AVX512)) return &avx512;
-    if (level >= GSF_CPU_AVX2) return &avx2;
-#endif
-    (void)level;
-    return &scalar;
-}
+static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level);
 
 enum { GSF__NN_CHUNK = 1 << 15 }; // values per chunk of elementwise work
 
@@ -3449,21 +3428,8 @@ static void gsf__norm_silu_scalar(const float* x, int64_t count, const float* me
         y[i] = gsf__nn_activation_ref(GSF__NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
 }
 
-#define gsf__moments_sums GSF__V(gsf__moments_sums)
-#define gsf__moments_add GSF__V(gsf__moments_add)
-#define gsf__norm_terms GSF__V(gsf__norm_terms)
-#define gsf__norm_terms_of GSF__V(gsf__norm_terms_of)
-#define gsf__norm_apply GSF__V(gsf__norm_apply)
-#define gsf__norm_value GSF__V(gsf__norm_value)
-
-#define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_NORMS
-#define GSF__KERNELS_AVX512
-#include "gsfixer.h"
-#undef GSF__KERNELS_NORMS
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_NORMS
+#ifdef GSF__KERNELS_NN
 
 typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean as two floats
 
@@ -3603,23 +3569,10 @@ GSF__V_KERNEL void GSF__V(gsf__norm_silu)(const float* x, int64_t count, const f
 }
 
 #endif
-#endif // GSF__KERNELS_NORMS
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
-static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
-    static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
-                                             gsf__norm_affine_scalar};
-#if GSF__X86
-    static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
-                                           gsf__norm_affine_avx2};
-    static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
-                                             gsf__norm_affine_avx512};
-    if (GSF__REACHES(level, AVX512)) return &avx512;
-    if (level >= GSF_CPU_AVX2) return &avx2;
-#endif
-    (void)level;
-    return &scalar;
-}
+static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level);
 
 static void gsf__norm_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
@@ -3959,15 +3912,61 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
                                                        NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
 
-// The epilogue: bias, activation, gate and residual.
+// ---- >>nn lanes -----------------------------------------------------------------
+/* Here the kernels written in the vector vocabulary are compiled, all but those of >>nn gradients. The sections are where
+   they are used; as each inclusion takes the preprocessor through the whole file once per instruction set, one compiles
+   them all. */
+
+static float gsf__int8_size(uint32_t top);
+
+#define gsf__v_gelu_tail GSF__V(gsf__v_gelu_tail)
+#define gsf__v_gelu_limit GSF__V(gsf__v_gelu_limit)
+#define gsf__v_gelu GSF__V(gsf__v_gelu)
+#define gsf__v_activate GSF__V(gsf__v_activate)
+#define gsf__moments_sums GSF__V(gsf__moments_sums)
+#define gsf__moments_add GSF__V(gsf__moments_add)
+#define gsf__norm_terms GSF__V(gsf__norm_terms)
+#define gsf__norm_terms_of GSF__V(gsf__norm_terms_of)
+#define gsf__norm_apply GSF__V(gsf__norm_apply)
+#define gsf__norm_value GSF__V(gsf__norm_value)
+
 #define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_EPILOGUE
+#define GSF__KERNELS_NN
 #define GSF__KERNELS_AVX512
-#include "gsfixer.h"
-#undef GSF__KERNELS_EPILOGUE
+#include "gsfixer.h" // compiles the sections GSF__KERNELS_NN of this file, once per instruction set
+#undef GSF__KERNELS_NN
+
+static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level) {
+    static const gsf__activation_kernels scalar = {gsf__activate_scalar, gsf__softmax_scalar};
+#if GSF__X86
+    static const gsf__activation_kernels avx2 = {gsf__activate_avx2, gsf__softmax_avx2};
+    static const gsf__activation_kernels avx512 = {gsf__activate_avx512, gsf__softmax_avx512};
+    if (GSF__REACHES(level, AVX512)) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
+    static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
+                                             gsf__norm_affine_scalar};
+#if GSF__X86
+    static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
+                                           gsf__norm_affine_avx2};
+    static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
+                                             gsf__norm_affine_avx512};
+    if (GSF__REACHES(level, AVX512)) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+// ---- linear: the epilogue (bias, activation, gate and residual)
 
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_EPILOGUE
+#ifdef GSF__KERNELS_NN
 #if GSF__LANES > 1
 
 // Writes `left` outputs from column `column` on; `sums` starts at that column.
@@ -3994,7 +3993,7 @@ GSF__V_KERNEL void GSF__V(gsf__epilogue)(const gsf__linear_job* job, const float
 }
 
 #endif
-#endif // GSF__KERNELS_EPILOGUE
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
 // ---- linear: AVX2 kernels
@@ -4839,15 +4838,8 @@ static const gsf__int8_kernels gsf__int8_scalar = {
     gsf__int8_rotate_scalar, gsf__int8_quantize_scalar, gsf__int8_quantize_scalar, sizeof(int16_t), gsf__int8_widen_scalar,
     gsf__int8_tile_scalar, NULL, gsf__int8_gemv_scalar, 2, gsf__int8_scale_scalar};
 
-// The rotation.
-#define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_INT8
-#define GSF__KERNELS_AVX512
-#include "gsfixer.h"
-#undef GSF__KERNELS_INT8
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_INT8
+#ifdef GSF__KERNELS_NN
 #if GSF__LANES > 1
 
 // Two butterfly steps, of `half` and twice `half`, a multiple of GSF__LANES.
@@ -4896,7 +4888,7 @@ GSF__V_KERNEL float GSF__V(gsf__int8_rotate)(float* x, int64_t count, int64_t bl
 }
 
 #endif
-#endif // GSF__KERNELS_INT8
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
 // ---- int8: AVX2 kernels
@@ -7136,13 +7128,8 @@ static void gsf__nn_patch(gsf_context* ctx, const gsf__nn_patch_job* job, int64_
 
 // ---- layers: 2D RoPE
 
-#define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_TURN
-#include "gsfixer.h" // compiles the code below once per instruction set
-#undef GSF__KERNELS_TURN
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_TURN
+#ifdef GSF__KERNELS_NN
 
 // Rotates the pairs (x[i], x[i + count]) by the angles given by cos and sin (count).
 GSF__V_KERNEL void GSF__V(gsf__nn_turn)(float* x, int64_t count, const float* cos, const float* sin) {
@@ -7155,18 +7142,10 @@ GSF__V_KERNEL void GSF__V(gsf__nn_turn)(float* x, int64_t count, const float* co
     }
 }
 
-#endif // GSF__KERNELS_TURN
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
 typedef void (*gsf__nn_turn_fn)(float* x, int64_t count, const float* cos, const float* sin);
-
-static gsf__nn_turn_fn gsf__nn_turn_of(gsf_cpu_level level) {
-#if GSF__X86
-    if (level >= GSF_CPU_AVX2) return gsf__nn_turn_avx2;
-#endif
-    (void)level;
-    return gsf__nn_turn_scalar;
-}
 
 enum { GSF__NN_TURN_ROWS = 32 }; // per chunk
 
@@ -7227,7 +7206,7 @@ static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b
     gsf__nn_norm_heads(run, &b->q_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q, rows, ld);
     gsf__nn_norm_heads(run, &b->k_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q + inner, rows, ld);
     if (!run->cos) return GSF_OK;
-    gsf__nn_turn_job job = {run, gsf__nn_turn_of(run->ctx->cpu_level), q, rows, ld};
+    gsf__nn_turn_job job = {run, GSF__WIDE_KERNEL_OF(run->ctx->cpu_level, gsf__nn_turn), q, rows, ld};
     gsf__parallel_for(run->ctx, gsf__nn_chunks(rows, GSF__NN_TURN_ROWS), gsf__nn_turn_chunk, &job);
     return GSF_OK;
 }
@@ -15775,14 +15754,8 @@ GSF_API gsf_result gsf_nn_make_mini(gsf_context* ctx, const gsf_nn_mini_desc* de
 
 // ---- metrics: kernels of feature maps
 
-#define GSF__KERNELS "gsfixer_nn.h"
-#define GSF__KERNELS_MAPS
-#define GSF__KERNELS_AVX512
-#include "gsfixer.h"
-#undef GSF__KERNELS_MAPS
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_MAPS
+#ifdef GSF__KERNELS_NN
 
 GSF__V_INLINE gsf__vf GSF__V(gsf__v_rectify)(gsf__vf x) { return gsf__v_max(gsf__v_set(0.0f), x); } // a NaN remains
 
@@ -15958,7 +15931,7 @@ GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, co
     }
 }
 
-#endif // GSF__KERNELS_MAPS
+#endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
 // ---- metrics: layers of feature maps

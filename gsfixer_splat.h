@@ -7411,10 +7411,18 @@ enum {
     GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 4 columns and 2 rows: splats are compact, so that this shape needs
                                          // fewer steps than 8 pixels of a row
     GSF__AHEAD = 8,                      // list entries whose steps are found together
-    GSF__SLOT_FLOATS = 12,
     GSF__PROJECT_CHUNK = 256,            // splats
     GSF__BUCKET = 4096,                  // steps that backward keeps at a time, plus the rest of the last entries
     GSF__KEPT_MOST = GSF__BUCKET + GSF__AHEAD * GSF__STEPS + 1,
+};
+
+// Slot layout. Sums over pixels, where p = dL/d(ln alpha), w = alpha*T, (e, dy) is the pixel's position in the record's
+// coordinates and D = sum(w z):
+enum {
+    GSF__SLOT_P, GSF__SLOT_E, GSF__SLOT_EE, GSF__SLOT_Y, GSF__SLOT_EY, GSF__SLOT_YY, // sums of p times 1 e ee dy e*dy dy*dy
+    GSF__SLOT_R, GSF__SLOT_G, GSF__SLOT_B, GSF__SLOT_Z,                              // sums of w times dL/dcolor, dL/dD
+    GSF__SLOT_ABS_X, GSF__SLOT_ABS_Y,                                                // sums of |dL/du|, |dL/dv|
+    GSF__SLOT_FLOATS,
 };
 
 #define GSF__ALPHA_MAX 0.99f
@@ -7439,6 +7447,8 @@ typedef struct gsf__record {
 } gsf__record;
 
 typedef struct gsf__tile_rect { int32_t x0, y0, x1, y1; } gsf__tile_rect; // tiles, end exclusive
+typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span;                 // of a tile row, end exclusive
+enum { GSF__SPANS = 8 }; // tile rows of which spans are found together; a multiple of the number of lanes
 
 typedef struct gsf__step { // kept by backward per splat and 8 pixels
     float alpha[8];        // before the 0.99 clamp; 0 where not blended
@@ -7652,15 +7662,16 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 #define gsf__v_any GSF__V(gsf__v_any)
 #define gsf__v_column GSF__V(gsf__v_column)
 
+// One inclusion for these, for >>bin and for >>project backward, as each takes the preprocessor through the whole file.
 #define GSF__KERNELS "gsfixer_splat.h"
-#define GSF__KERNELS_PROJECT
+#define GSF__KERNELS_SPLATS
 #define GSF__KERNELS_SIMD128
 #define GSF__KERNELS_AVX512
 #include "gsfixer.h" // compiles what follows, once per instruction set
-#undef GSF__KERNELS_PROJECT
+#undef GSF__KERNELS_SPLATS
 
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_PROJECT
+#ifdef GSF__KERNELS_SPLATS
 
 // Intermediate results of the projection that backward needs again. One splat per lane.
 typedef struct gsf__projection {
@@ -7997,7 +8008,7 @@ GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view
     }
 }
 
-#endif // GSF__KERNELS_PROJECT
+#endif // GSF__KERNELS_SPLATS
 #ifndef GSF__ISA
 
 typedef struct gsf__splat_loop { // a loop over all splats
@@ -8034,8 +8045,6 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
 
 // ---- >>bin ---------------------------------------------------------------------
 
-typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusive
-
 // Tile rows that the splat overlaps: first and one past the last.
 static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
     const float reach_y = gsf__reach_y(rec);
@@ -8053,16 +8062,8 @@ static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* v
     return rows;
 }
 
-enum { GSF__SPANS = 8 }; // tile rows processed at a time; a multiple of the number of lanes
-
-#define GSF__KERNELS "gsfixer_splat.h"
-#define GSF__KERNELS_BIN
-#define GSF__KERNELS_SIMD128
-#include "gsfixer.h" // compiles what follows, once per instruction set
-#undef GSF__KERNELS_BIN
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_BIN
+#if defined(GSF__KERNELS_SPLATS) && GSF__LANES <= 8
 
 // The tiles that the ellipse alpha >= 1/255 overlaps in the tile rows from ty on (exact up to the margins); empty if
 // x1 <= x0. One tile row per lane.
@@ -8095,7 +8096,7 @@ GSF__V_KERNEL void GSF__V(gsf__tile_columns)(const gsf_rasterizer* r, const gsf_
     }
 }
 
-#endif // GSF__KERNELS_BIN
+#endif // GSF__KERNELS_SPLATS
 #ifndef GSF__ISA
 
 typedef struct gsf__bin_job {
@@ -8256,14 +8257,6 @@ typedef struct gsf__raster_kernels {
     void (*reverse)(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
                     gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int flags);
 } gsf__raster_kernels;
-
-// Slot layout. Sums over pixels, where p = dL/d(ln alpha), w = alpha*T, (e, dy) is the pixel's position in the record's
-// coordinates and D = sum(w z):
-enum {
-    GSF__SLOT_P, GSF__SLOT_E, GSF__SLOT_EE, GSF__SLOT_Y, GSF__SLOT_EY, GSF__SLOT_YY, // sums of p times 1 e ee dy e*dy dy*dy
-    GSF__SLOT_R, GSF__SLOT_G, GSF__SLOT_B, GSF__SLOT_Z,                              // sums of w times dL/dcolor, dL/dD
-    GSF__SLOT_ABS_X, GSF__SLOT_ABS_Y,                                                // sums of |dL/du|, |dL/dv|
-};
 
 // 2^x for x in [-126, 1], relative error below 2e-7 (minimax polynomial of degree 5 on [-1/2, 1/2]).
 static float gsf__exp2_fast(float x) {
@@ -9227,14 +9220,8 @@ static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
 
 // ---- >>project backward --------------------------------------------------------
 
-#define GSF__KERNELS "gsfixer_splat.h"
-#define GSF__KERNELS_GATHER
-#define GSF__KERNELS_SIMD128
-#include "gsfixer.h" // compiles what follows, once per instruction set
-#undef GSF__KERNELS_GATHER
-
 #endif // GSF__ISA
-#ifdef GSF__KERNELS_GATHER
+#if defined(GSF__KERNELS_SPLATS) && GSF__LANES <= 8
 
 // Derivative of sum(weight * basis) with respect to the direction, without that of the normalisation. count >= 4.
 GSF__V_INLINE void GSF__V(gsf__sh_direction_gradient)(const gsf__vf d[3], int32_t count, const gsf__vf weight[16],
@@ -9469,7 +9456,7 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
     }
 }
 
-#endif // GSF__KERNELS_GATHER
+#endif // GSF__KERNELS_SPLATS
 #ifndef GSF__ISA
 
 // In index order, so that parameters and gradients stream through the cache.
