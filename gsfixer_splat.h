@@ -9283,25 +9283,26 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
 }
 
 // Prefetches data of the splats from i on: their slots are scattered over memory, and rows of SH are long.
-GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads,
-                                             size_t i) {
+GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
+                                             const gsf_splat_grads* grads, size_t i) {
     for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + GSF__LANES]; s++) {
         const float* slot = r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s];
         gsf__v_fetch(slot);
         gsf__v_fetch(slot + GSF__SLOT_FLOATS - 1);
     }
-    const size_t row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree);
-    for (size_t k = 0; k < GSF__LANES * row; k += 16) {
-        gsf__v_fetch(splats->sh + row * i + k);
-        if (grads->sh) gsf__v_fetch(grads->sh + row * i + k);
-    }
+    const size_t row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree), used = 3 * (size_t)view->sh_coefficients;
+    for (size_t at = row * i, end = at + GSF__LANES * row; at < end; at += row)
+        for (size_t k = 0; k < used; k += 16) {
+            if (used > 3) gsf__v_fetch(splats->sh + at + k);
+            if (grads->sh) gsf__v_fetch(grads->sh + at + k);
+        }
 }
 
 // Gradients of the splats from i on: backpropagates the sums of their slots through covariance, projection and colour.
 GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                        const gsf_splat_grads* grads, size_t i, size_t left) {
     const size_t count = left < GSF__LANES ? left : GSF__LANES;
-    if (left >= 2 * GSF__LANES) GSF__V(gsf__gather_ahead)(r, splats, grads, i + GSF__LANES);
+    if (left >= 2 * GSF__LANES) GSF__V(gsf__gather_ahead)(r, view, splats, grads, i + GSF__LANES);
     gsf__vf sums[16];
     const uint32_t touched = GSF__V(gsf__sum_slots)(r, i, count, sums);
     if (!touched) return;
@@ -9393,20 +9394,19 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
     GSF__V(gsf__sh_basis)(d[0], d[1], d[2], bands, basis);
     if (grads->sh) {
         float* rows = grads->sh + (size_t)stored * i;
+        gsf__vf d_sh[48];
         int k = 0;
-        for (; k < 3 * bands && k + GSF__LANES <= stored; k += GSF__LANES) {
-            gsf__vf block[GSF__LANES];
-            for (int j = 0; j < GSF__LANES; j++) {
-                block[j] = zero;
-                if (k + j < 3 * bands) block[j] = basis[(k + j) / 3] * d_rgb[(k + j) % 3];
-            }
-            gsf__v_transpose(block);
+        for (int band = 0; band < bands; band++)
+            for (int c = 0; c < 3; c++) d_sh[k++] = basis[band] * d_rgb[c];
+        for (; k % GSF__LANES; k++) d_sh[k] = zero;
+        for (k = 0; k < 3 * bands && k + GSF__LANES <= stored; k += GSF__LANES) {
+            gsf__v_transpose(d_sh + k);
             for (size_t l = 0; l < count; l++) {
                 float* row = rows + (size_t)stored * l + k;
-                if (touched >> l & 1u) gsf__v_store(row, gsf__v_load(row) + block[l]);
+                if (touched >> l & 1u) gsf__v_store(row, gsf__v_load(row) + d_sh[k + (int)l]);
             }
         }
-        for (; k < 3 * bands; k++) GSF__V(gsf__add_column)(rows + k, (size_t)stored, basis[k / 3] * d_rgb[k % 3], count);
+        for (; k < 3 * bands; k++) GSF__V(gsf__add_column)(rows + k, (size_t)stored, d_sh[k], count);
     }
     if (grads->means) {
         if (bands > 1) {
