@@ -10259,21 +10259,27 @@ static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_b
     }
 }
 
-static void gsf__loss_band(void* arg, size_t band, int32_t worker) {
-    const gsf__loss_job* job = (const gsf__loss_job*)arg;
-    const int32_t height = job->target->height, rows = gsf__loss_band_rows(height);
+// The rows of a band, and the worker's buffers. row: floats from one row of the scratch to the next.
+static gsf__loss_buffers gsf__loss_buffers_of(float* scratch, size_t row, int32_t height, size_t band, int32_t worker) {
+    const int32_t rows = gsf__loss_band_rows(height);
     gsf__loss_buffers b;
     b.first = (int32_t)band * rows;
     b.end = height - b.first > rows ? b.first + rows : height;
-    b.images = job->rows + (size_t)worker * GSF__LOSS_WORKER_ROWS * job->row + GSF__LOSS_MARGIN;
-    b.slopes = b.images + 4 * GSF__LOSS_IMAGES * job->row;
-    b.sums = b.slopes + 3 * GSF__LOSS_SLOPES * job->row;
-    b.vertical = b.sums + 4 * GSF__LOSS_GROUP * job->row;
-    b.outside = b.vertical + GSF__LOSS_GROUP * job->row;
-    b.middle[0] = b.outside + 4 * job->row;
-    b.middle[1] = b.middle[0] + job->row;
-    b.weight = b.middle[1] + job->row;
-    b.render = b.weight + job->row;
+    b.images = scratch + (size_t)worker * GSF__LOSS_WORKER_ROWS * row + GSF__LOSS_MARGIN;
+    b.slopes = b.images + 4 * GSF__LOSS_IMAGES * row;
+    b.sums = b.slopes + 3 * GSF__LOSS_SLOPES * row;
+    b.vertical = b.sums + 4 * GSF__LOSS_GROUP * row;
+    b.outside = b.vertical + GSF__LOSS_GROUP * row;
+    b.middle[0] = b.outside + 4 * row;
+    b.middle[1] = b.middle[0] + row;
+    b.weight = b.middle[1] + row;
+    b.render = b.weight + row;
+    return b;
+}
+
+static void gsf__loss_band(void* arg, size_t band, int32_t worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    gsf__loss_buffers b = gsf__loss_buffers_of(job->rows, job->row, job->target->height, band, worker);
     for (size_t i = 0; i < job->n; i++) b.weight[i] = i < job->valid ? 1.0f : 0.0f;
     gsf__loss_fill_middle(job, &b);
     double* totals = job->sums + 2 * band;
@@ -10341,7 +10347,7 @@ typedef struct gsf__smooth_job {
     const gsf__target* target;
     const float* depth;
     float* d_depth;
-    double* sums;
+    gsf__loss_scratch* scratch;
     float extent, factor;
 } gsf__smooth_job;
 
@@ -10354,40 +10360,59 @@ static float gsf__smooth_edge(const gsf__target* target, size_t p, size_t q) {
     return 1.0f / (1.0f + scale * d * (scale * d));
 }
 
-static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
-    const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
-    (void)worker;
-    const int32_t width = job->target->width, height = job->target->height, rows = gsf__loss_band_rows(height);
-    const int32_t first = (int32_t)band * rows, end = height - first > rows ? first + rows : height;
-    double sum = 0.0;
-    for (int32_t y = first; y < end; y++)
-        for (int32_t x = 0; x < width; x++) {
-            const size_t at = (size_t)y * (size_t)width + (size_t)x;
-            const float z = job->depth[at], here = z > 0.0f ? job->extent / z : 0.0f;
-            float slope = 0.0f; // derivative of the sum with respect to D at this pixel
-            const int inside[4] = {x + 1 < width, y + 1 < height, x > 0, y > 0};
-            const ptrdiff_t pixel[4] = {1, width, -1, -(ptrdiff_t)width};
-            for (int k = 0; z > 0.0f && k < 4; k++) {
-                if (!inside[k]) continue;
-                const size_t next = (size_t)((ptrdiff_t)at + pixel[k]);
-                const float other = job->depth[next];
-                if (!(other > 0.0f)) continue;
-                const float diff = here - job->extent / other, edge = gsf__smooth_edge(job->target, at, next);
-                slope += diff > 0.0f ? edge : diff < 0.0f ? -edge : 0.0f;
-                if (k < 2) sum += (double)(edge * fabsf(diff));
-            }
-            job->d_depth[at] = z > 0.0f ? -job->factor * slope * here / z : 0.0f; // dD/dz = -extent / z^2
-        }
-    job->sums[band] = sum;
+// e_pq |a - b| is added to the sum; returns its derivative with respect to a, where a and b are D_p and D_q, or -1: none.
+static float gsf__smooth_pair(const gsf__target* target, size_t p, size_t q, float a, float b, double* sum) {
+    if (!(a >= 0.0f && b >= 0.0f)) return 0.0f;
+    const float diff = a - b, edge = gsf__smooth_edge(target, p, q);
+    *sum += (double)(edge * fabsf(diff));
+    return diff > 0.0f ? edge : diff < 0.0f ? -edge : 0.0f;
 }
 
-static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* scratch, const gsf__target* target,
+static void gsf__smooth_row(const gsf__smooth_job* job, int32_t y, float* nearness) {
+    const size_t width = (size_t)job->target->width, at = (size_t)y * width;
+    for (size_t x = 0; x < width; x++) {
+        const float z = y < job->target->height ? job->depth[at + x] : 0.0f;
+        nearness[x] = z > 0.0f ? job->extent / z : -1.0f;
+    }
+}
+
+// Each pair is computed once: the derivative with respect to the one pixel is minus that with respect to the other.
+static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
+    const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
+    const size_t width = (size_t)job->target->width;
+    const gsf__loss_buffers b = gsf__loss_buffers_of(job->scratch->rows, gsf__loss_row(job->target->width),
+                                                     job->target->height, band, worker);
+    float *here = b.weight, *below = here + width, *down = below + width; // down: derivatives at the row above
+    double sum = 0.0, of_band_above = 0.0;
+    int32_t y = b.first > 0 ? b.first - 1 : 0; // pairs with the band above belong to that band's sum
+    gsf__smooth_row(job, y, here);
+    memset(down, 0, width * sizeof *down);
+    for (; y < b.end; y++) {
+        double* to = y < b.first ? &of_band_above : &sum;
+        float right = 0.0f;
+        gsf__smooth_row(job, y + 1, below);
+        for (size_t x = 0; x < width; x++) {
+            const size_t at = (size_t)y * width + x;
+            const float left = right, up = down[x], z = job->depth[at];
+            right = x + 1 < width ? gsf__smooth_pair(job->target, at, at + 1, here[x], here[x + 1], to) : 0.0f;
+            down[x] = gsf__smooth_pair(job->target, at, at + width, here[x], below[x], to);
+            if (y >= b.first) // dD/dz = -extent / z^2
+                job->d_depth[at] = z > 0.0f ? -job->factor * (right + down[x] - left - up) * here[x] / z : 0.0f;
+        }
+        float* next = here;
+        here = below;
+        below = next;
+    }
+    job->scratch->sums[band] = sum;
+}
+
+static double gsf__depth_smoothness(gsf_context* ctx, gsf__loss_scratch* scratch, const gsf__target* target,
                                     const float* depth, float extent, float weight, float* d_depth) {
     gsf__smooth_job job;
     job.target = target;
     job.depth = depth;
     job.d_depth = d_depth;
-    job.sums = scratch->sums;
+    job.scratch = scratch;
     job.extent = extent;
     job.factor = (float)((double)weight / ((double)target->width * (double)target->height));
     const size_t bands = gsf__loss_band_count(target->height);

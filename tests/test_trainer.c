@@ -255,7 +255,7 @@ static void test_loss_weights(gsf_cpu_level level) {
 }
 
 static void test_smoothness_derivative(gsf_context* ctx) {
-    enum { W = 9, H = 19 };
+    enum { W = 9, H = 70 }; // two bands
     float photo[3 * W * H], render[3 * W * H], ignored[3 * W * H], depth[W * H], d[W * H], other[W * H];
     uint64_t state = 9;
     for (int i = 0; i < 3 * W * H; i++) photo[i] = render[i] = (float)test_random(&state);
