@@ -3912,10 +3912,9 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
                                                        NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
 
-// ---- >>nn lanes -----------------------------------------------------------------
-/* Here the kernels written in the vector vocabulary are compiled, all but those of >>nn gradients. The sections are where
-   they are used; as each inclusion takes the preprocessor through the whole file once per instruction set, one compiles
-   them all. */
+// ---- linear: where kernels are compiled for the instruction sets
+// Those of all sections written in the vector vocabulary, except the gradients' of >>nn training: one inclusion for all, as
+// each takes the preprocessor through the whole file once per instruction set.
 
 static float gsf__int8_size(uint32_t top);
 
