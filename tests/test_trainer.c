@@ -258,9 +258,9 @@ static void test_smoothness_derivative(gsf_context* ctx) {
     enum { W = 9, H = 70 }; // two bands
     float photo[3 * W * H], render[3 * W * H], ignored[3 * W * H], depth[W * H], d[W * H], other[W * H];
     uint64_t state = 9;
-    int kinks = 0;
     for (int i = 0; i < 3 * W * H; i++) photo[i] = render[i] = (float)test_random(&state);
-    for (int i = 0; i < W * H; i++) depth[i] = i % 7 == 3 ? 0.0f : (float)test_random_in(&state, 1, 3);
+    // between 1 and 3, and no two neighbours close to the kink at the same depth
+    for (int i = 0; i < W * H; i++) depth[i] = i % 7 == 3 ? 0.0f : 1.0f + 2.0f * (float)(i * 257 % (W * H)) / (W * H);
     gsf__loss_scratch scratch;
     memset(&scratch, 0, sizeof scratch);
     gsf__target target;
@@ -277,13 +277,6 @@ static void test_smoothness_derivative(gsf_context* ctx) {
             continue;
         }
         const float kept = depth[i];
-        int kink = 0; // a neighbour at the same depth to within the step
-        for (int k = 0; k < 4; k++) {
-            const int next = i + (k == 0 ? 1 : k == 1 ? -1 : k == 2 ? W : -W);
-            kink |= next >= 0 && next < W * H && fabsf(depth[next] - kept) < 1.1e-3f;
-        }
-        kinks += kink;
-        if (kink) continue;
         depth[i] = kept + 1e-3f;
         const double high = gsf__depth_smoothness(ctx, &scratch, &target, depth, 2.0f, 0.7f, other);
         depth[i] = kept - 1e-3f;
@@ -291,7 +284,6 @@ static void test_smoothness_derivative(gsf_context* ctx) {
         depth[i] = kept;
         CHECK_NEAR(d[i], (high - low) / 2e-3, 2e-5);
     }
-    CHECK(kinks < 6);
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
 
