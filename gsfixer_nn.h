@@ -738,6 +738,9 @@ typedef struct gsf__nn_linear_desc {
     int32_t accumulate;        // y += activation(x w^T + b) instead of y = ...
     float* y;                  // (rows, out), row stride ldy
     int64_t ldy;               // 0: out
+    int32_t transposed_x;      // x is (in, rows), row stride ldx, 0: rows
+    int32_t transposed_weight; // weight is (in, out), row stride ldw, 0: out
+    int64_t ldw;
     int32_t bf16;              // for bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: also rounds x to bf16, sums
                                // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
@@ -3795,6 +3798,8 @@ typedef struct gsf__linear_job gsf__linear_job;
 typedef struct gsf__linear_kernels { // one set per instruction set
     // out[k][16]: `columns` rows of weights, `pitch` bytes apart, transposed; missing columns are zero
     void (*pack_weights)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
+    // The same from weights that are stored transposed, `count` rows of `columns`
+    void (*pack_transposed)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
     // out[k][6]: `rows` rows of x, transposed; missing rows are zero; may write two floats more
     void (*pack_rows)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
     // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; also prefetches `ahead_count` floats that are needed next
@@ -3824,7 +3829,7 @@ struct gsf__linear_job {
     gsf__nn_linear_desc desc;
     gsf__linear_plan plan;
     const gsf__linear_kernels* kernels;
-    int64_t in, out;
+    int64_t in, out, ldw;
     int64_t length;               // `in` in units
     int64_t first, columns;       // the current group of outputs
     float *bias, *packed, *gemv_x; // bias: zeros if there is none, 16 more than `out`
@@ -3865,6 +3870,14 @@ static void gsf__pack_weights_scalar(const char* w, gsf_nn_dtype dtype, size_t p
                                      float* out) {
     if (columns < GSF__TILE_COLUMNS) memset(out, 0, (size_t)(count * GSF__TILE_COLUMNS) * sizeof(float));
     gsf__pack_corner(w, dtype, pitch, 0, columns, 0, count, out);
+}
+
+static void gsf__pack_transposed_scalar(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count,
+                                        float* out) {
+    const size_t size = gsf_nn_get_dtype_size(dtype);
+    for (int64_t k = 0; k < count; k++, w += pitch)
+        for (int64_t c = 0; c < GSF__TILE_COLUMNS; c++)
+            *out++ = c < columns ? gsf__nn_load(w + (size_t)c * size, dtype) : 0.0f;
 }
 
 static void gsf__pack_rows_scalar(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
@@ -3909,8 +3922,9 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
         }
 }
 
-static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
-                                                       NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
+static const gsf__linear_kernels gsf__linear_scalar = {
+    gsf__pack_weights_scalar, gsf__pack_transposed_scalar, gsf__pack_rows_scalar, gsf__tile_scalar, NULL,
+    gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
 
 // ---- linear: where kernels are compiled for the instruction sets
 // Those of all sections written in the vector vocabulary, except the gradients' of >>nn training: one inclusion for all, as
@@ -4033,6 +4047,22 @@ GSF__TARGET_AVX2 static void gsf__pack_weights_avx2(const char* w, gsf_nn_dtype 
     if (dtype == GSF_NN_F32) gsf__pack_weights8(w, GSF_NN_F32, 4, pitch, columns, count, out);
     else if (dtype == GSF_NN_BF16) gsf__pack_weights8(w, GSF_NN_BF16, 2, pitch, columns, count, out);
     else gsf__pack_weights8(w, GSF_NN_F16, 2, pitch, columns, count, out);
+}
+
+GSF__INLINE_AVX2 void gsf__pack_transposed8(const char* w, gsf_nn_dtype dtype, size_t size, size_t pitch, int64_t count,
+                                            float* out) {
+    for (int64_t k = 0; k < count; k++, w += pitch, out += GSF__TILE_COLUMNS) {
+        _mm256_storeu_ps(out, gsf__load8(w, dtype));
+        _mm256_storeu_ps(out + 8, gsf__load8(w + 8 * size, dtype));
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__pack_transposed_avx2(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns,
+                                                       int64_t count, float* out) {
+    if (columns < GSF__TILE_COLUMNS) gsf__pack_transposed_scalar(w, dtype, pitch, columns, count, out);
+    else if (dtype == GSF_NN_F32) gsf__pack_transposed8(w, GSF_NN_F32, 4, pitch, count, out);
+    else if (dtype == GSF_NN_BF16) gsf__pack_transposed8(w, GSF_NN_BF16, 2, pitch, count, out);
+    else gsf__pack_transposed8(w, GSF_NN_F16, 2, pitch, count, out);
 }
 
 GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
@@ -4211,8 +4241,9 @@ GSF__TARGET_AVX2 static void gsf__gemv_avx2(const gsf__linear_job* job, int64_t 
     else gsf__gemv8(job, GSF_NN_F16, 2, column, columns, sums, pitch);
 }
 
-static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                     NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1};
+static const gsf__linear_kernels gsf__linear_avx2 = {
+    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__tile_avx2, NULL, gsf__epilogue_avx2,
+    gsf__gemv_avx2, 8, 1};
 
 // ---- linear: AVX-512 kernels
 
@@ -4417,9 +4448,9 @@ GSF__TARGET_AVX512 static void gsf__gemv_avx512(const gsf__linear_job* job, int6
 #undef GSF_X
 }
 
-static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                       gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512,
-                                                       16, 1};
+static const gsf__linear_kernels gsf__linear_avx512 = {
+    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__tile_avx2, gsf__four_tiles_avx512,
+    gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1};
 
 // ---- linear: kernels for pairs of bf16
 
@@ -4476,8 +4507,9 @@ GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b
     GSF__LINEAR_FOUR(gsf__nn_add_pairs)
 }
 
-static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf__pack_rows_bf16, gsf__tile_bf16,
-                                                     gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2};
+static const gsf__linear_kernels gsf__linear_bf16 = {
+    gsf__pack_weights_bf16, NULL, gsf__pack_rows_bf16, gsf__tile_bf16, gsf__four_tiles_bf16, gsf__epilogue_avx512,
+    gsf__gemv_avx512, 16, 2};
 
 #endif
 
@@ -4499,17 +4531,40 @@ static float* gsf__packed_panel(const gsf__linear_job* job, int64_t at, int64_t 
     return job->packed + k * gsf__round_up(job->columns, GSF__TILE_COLUMNS) + at * count;
 }
 
+// One step of a panel: the outputs from `column` on, up to 16 of them.
+static void gsf__pack_panel(const gsf__linear_job* job, int64_t column, int64_t columns, int64_t k, int64_t count,
+                            float* out) {
+    const gsf_nn_tensor* w = job->desc.weight;
+    const size_t size = gsf_nn_get_dtype_size(w->dtype), pitch = (size_t)job->ldw * size;
+    const int64_t value = k * job->kernels->unit, width = gsf__least(columns, GSF__TILE_COLUMNS);
+    const char* data = (const char*)w->data;
+    if (job->desc.transposed_weight)
+        job->kernels->pack_transposed(data + (size_t)value * pitch + (size_t)column * size, w->dtype, pitch, width, count, out);
+    else
+        job->kernels->pack_weights(data + (size_t)column * pitch + (size_t)value * size, w->dtype, pitch, width, count, out);
+}
+
+// One step of a group: the rows from `row` on, up to 6 of them.
+static void gsf__pack_group(const gsf__linear_job* job, int64_t row, int64_t rows, int64_t k, int64_t count, float* out) {
+    const int64_t height = gsf__least(rows, GSF__TILE_ROWS), ld = job->desc.ldx;
+    if (!job->desc.transposed_x) {
+        job->kernels->pack_rows(job->desc.x + row * ld + k * job->kernels->unit, ld, height, count, out);
+        return;
+    }
+    const float* x = job->desc.x + k * ld + row;
+    for (int64_t i = 0; i < count; i++, x += ld, out += GSF__TILE_ROWS) {
+        if (height == GSF__TILE_ROWS) memcpy(out, x, GSF__TILE_ROWS * sizeof *out);
+        for (int64_t r = 0; height < GSF__TILE_ROWS && r < GSF__TILE_ROWS; r++) out[r] = r < height ? x[r] : 0.0f;
+    }
+}
+
 static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { // of the current group, its full depth
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
-    const gsf_nn_tensor* w = job->desc.weight;
-    const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS, width = gsf__least(job->columns - at, GSF__TILE_COLUMNS);
-    const size_t size = gsf_nn_get_dtype_size(w->dtype), pitch = (size_t)job->in * size;
-    const char* from = (const char*)w->data + (size_t)(job->first + at) * pitch;
+    const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS;
     (void)worker;
     for (int64_t k = 0; k < job->length; k += job->plan.depth) {
         const int64_t count = gsf__least(job->length - k, job->plan.depth);
-        float* to = gsf__packed_panel(job, at, k, count);
-        job->kernels->pack_weights(from + (size_t)(k * job->kernels->unit) * size, w->dtype, pitch, width, count, to);
+        gsf__pack_panel(job, job->first + at, job->columns - at, k, count, gsf__packed_panel(job, at, k, count));
     }
 }
 
@@ -4540,29 +4595,23 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
 static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a block of rows and outputs
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf__linear_plan* plan = &job->plan;
-    const gsf__nn_linear_desc* d = &job->desc;
     const int64_t row = (int64_t)index % plan->row_blocks * plan->block_rows;
     const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // within the group
-    const int64_t rows = gsf__least(d->rows - row, plan->block_rows);
+    const int64_t rows = gsf__least(job->desc.rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
     const int64_t groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
-    const size_t size = gsf_nn_get_dtype_size(d->weight->dtype), pitch = (size_t)job->in * size;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both are padded to whole tiles
     float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
     for (int64_t k = 0; k < job->length; k += plan->depth) {
-        const int64_t count = gsf__least(job->length - k, plan->depth), value = k * job->kernels->unit;
-        for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS)
-            job->kernels->pack_rows(d->x + (row + r) * d->ldx + value, d->ldx, gsf__least(rows - r, GSF__TILE_ROWS), count,
-                                    x + r * count);
+        const int64_t count = gsf__least(job->length - k, plan->depth);
+        for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS) gsf__pack_group(job, row + r, rows - r, k, count, x + r * count);
         for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
             const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), next = groups * GSF__TILE_SUMS;
             const int64_t column = job->first + at + c;
             const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, count);
             for (int64_t p = 0; plan->lone && p < width; p += GSF__TILE_COLUMNS)
-                job->kernels->pack_weights((const char*)d->weight->data + (size_t)(column + p) * pitch + (size_t)value * size,
-                                           d->weight->dtype, pitch, gsf__least(width - p, GSF__TILE_COLUMNS), count,
-                                           panel + p * count);
+                gsf__pack_panel(job, column + p, width - p, k, count, panel + p * count);
             gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, count, row, rows, column, width);
         }
     }
@@ -4590,11 +4639,11 @@ static void gsf__gemv_order(gsf__linear_job* job) {
 }
 
 // Plans (rows, in) x (out, in)^T; returns 0 if the size of the scratch memory overflows.
-static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight_size, gsf__linear_plan* plan) {
+static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight_size, int gemv, gsf__linear_plan* plan) {
     memset(plan, 0, sizeof *plan);
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
     size_t shared = 0;
-    if (rows <= GSF__GEMV_ROWS) {
+    if (gemv) {
         const int64_t least = GSF__GEMV_BYTES / (in * (int64_t)weight_size) + 1, share = gsf__ceil_div(out, GSF__GEMV_CHUNKS);
         plan->gemv = 1;
         plan->block_columns = gsf__round_up(gsf__least(share < least ? least : share, GSF__GEMV_COLUMNS), GSF__GEMV_UNIT);
@@ -4628,12 +4677,13 @@ static gsf_result gsf__check_linear(gsf_context* ctx, const gsf__nn_linear_desc*
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: %s is not a matrix", name);
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "linear: %s is %s", name, gsf__nn_dtype_name(w->dtype));
-    *out = w->shape[0];
-    *in = w->count / w->shape[0];
+    *out = desc->transposed_weight ? w->count / w->shape[0] : w->shape[0];
+    *in = w->count / *out;
     if (desc->bias && (desc->bias->count != *out || !desc->bias->data))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: %s has %lld values, not %lld",
                         desc->bias->name ? desc->bias->name : "bias", (long long)desc->bias->count, (long long)*out);
-    if ((desc->ldx && desc->ldx < *in) || (desc->ldy && desc->ldy < *out))
+    if ((desc->ldx && desc->ldx < (desc->transposed_x ? desc->rows : *in)) || (desc->ldw && desc->ldw < *out) ||
+        (desc->ldy && desc->ldy < *out))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: rows of %lld and %lld values, but %s is (%lld, %lld)",
                         (long long)desc->ldx, (long long)desc->ldy, name, (long long)*out, (long long)*in);
     return GSF_OK;
@@ -4667,13 +4717,15 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
     GSF__TRY(gsf__check_linear(ctx, desc, &job.in, &job.out));
     if (desc->rows == 0) return GSF_OK;
     job.desc = *desc;
-    if (!job.desc.ldx) job.desc.ldx = job.in;
+    if (!job.desc.ldx) job.desc.ldx = desc->transposed_x ? desc->rows : job.in;
     if (!job.desc.ldy) job.desc.ldy = job.out;
-    const int gemv = desc->rows <= GSF__GEMV_ROWS;
-    const int pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0;
+    job.ldw = !desc->transposed_weight ? job.in : desc->ldw ? desc->ldw : job.out;
+    const int turned = desc->transposed_x || desc->transposed_weight;
+    const int gemv = desc->rows <= GSF__GEMV_ROWS && !turned;
+    const int pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0 && !turned;
     job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !gemv);
     job.length = job.in / job.kernels->unit;
-    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), &job.plan) ||
+    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), gemv, &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
         floats > SIZE_MAX - job.plan.shared || !gsf__mul_size(floats + job.plan.shared, sizeof(float), &bytes))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows x %lld x %lld", (long long)desc->rows,
@@ -18159,8 +18211,6 @@ typedef struct gsf__grad_job {
     const gsf__norm_kernels* norms;
     gsf__nn_activation activation;
     const float *x, *dy, *weight, *scale; // softmax: x is the forward pass's result
-    const char* data;                     // the matrix to transpose
-    gsf_nn_dtype dtype;
     float* dx;
     int64_t rows, columns, ld, chunk_rows;
     // adds row `row` to the sums per column; norms: products are of dy and the normalised x
@@ -18855,29 +18905,6 @@ GSF__SHARED void gsf__nn_group_norm_grad(gsf_context* ctx, const float* x, const
 
 // ---- training: linear layers
 
-enum { GSF__GRAD_TILE = 32 };
-
-static void gsf__transpose_chunk(void* arg, size_t chunk, int32_t worker) { // GSF__GRAD_TILE columns
-    const gsf__grad_job* job = (const gsf__grad_job*)arg;
-    const size_t size = gsf_nn_get_dtype_size(job->dtype);
-    const int64_t first = (int64_t)chunk * GSF__GRAD_TILE, last = gsf__least(first + GSF__GRAD_TILE, job->columns);
-    (void)worker;
-    for (int64_t top = 0; top < job->rows; top += GSF__GRAD_TILE)
-        for (int64_t c = first; c < last; c++)
-            for (int64_t r = top; r < top + GSF__GRAD_TILE && r < job->rows; r++)
-                job->dx[c * job->rows + r] = gsf__nn_load(job->data + (size_t)(r * job->ld + c) * size, job->dtype);
-}
-
-// out (columns, rows) = the transpose of data (rows, columns) with row stride ld, widened to float
-static void gsf__nn_transpose(gsf_context* ctx, const void* data, gsf_nn_dtype dtype, int64_t rows, int64_t columns, int64_t ld,
-                              float* out) {
-    gsf__grad_job job = gsf__grad_begin(ctx, NULL, NULL, rows, columns, out);
-    job.data = (const char*)data;
-    job.dtype = dtype;
-    job.ld = ld;
-    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(columns, GSF__GRAD_TILE), gsf__transpose_chunk, &job);
-}
-
 typedef struct gsf__nn_linear_grad_desc {
     const float* x;            // (rows, in), row stride ldx
     int64_t rows, ldx;         // ldx 0: in
@@ -18888,11 +18915,10 @@ typedef struct gsf__nn_linear_grad_desc {
     float *dweight, *dbias;    // (out, in), (out), added to; each may be NULL
 } gsf__nn_linear_grad_desc;
 
-// y = x w^T + b: dx = dy w, dw = dy^T x, db = the sum of dy's rows
-GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linear_grad_desc* d) {
+// y = x w^T + b: dx = dy w, dw = dy^T x, db = the sum of dy's rows. `workspace` NULL: scratch is allocated for this call only.
+GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_linear_grad_desc* d) {
     gsf__nn_linear_desc multiply;
     int64_t in, out;
-    size_t inner, outer, product;
     memset(&multiply, 0, sizeof multiply);
     multiply.x = d->x;
     multiply.rows = d->rows;
@@ -18902,40 +18928,28 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linea
     GSF__TRY(gsf__check_linear(ctx, &multiply, &in, &out));
     if (!d->dy) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: dy is missing");
     if (d->rows == 0) return GSF_OK;
-    if (!gsf__mul_size((size_t)in, (size_t)d->rows, &inner) || !gsf__mul_size((size_t)out, (size_t)d->rows, &outer) ||
-        inner > SIZE_MAX - outer)
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows", (long long)d->rows);
-    product = (size_t)d->weight->count; // of the transposed weight, then of the transposed x and dy
-    float* scratch = (float*)gsf_alloc(ctx, inner + outer > product ? inner + outer : product, sizeof(float));
-    if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_result result = GSF_OK;
     if (d->dx) {
-        const int64_t shape[2] = {in, out};
-        const gsf_nn_tensor weight = gsf_nn_wrap_tensor(NULL, scratch, 2, shape);
-        gsf__nn_transpose(ctx, d->weight->data, d->weight->dtype, out, in, in, scratch);
+        multiply.x = d->dy;
+        multiply.ldx = 0;
+        multiply.transposed_weight = 1;
+        multiply.accumulate = d->accumulate;
+        GSF__TRY(gsf__nn_run_linear(ctx, workspace, &multiply));
+    }
+    if (d->dweight) {
+        const int64_t shape[2] = {d->rows, in};
+        const gsf_nn_tensor x = gsf_nn_wrap_tensor(NULL, d->x, 2, shape);
         memset(&multiply, 0, sizeof multiply);
         multiply.x = d->dy;
-        multiply.rows = d->rows;
-        multiply.weight = &weight;
-        multiply.accumulate = d->accumulate;
-        multiply.y = d->dx;
-        result = gsf__nn_run_linear(ctx, NULL, &multiply);
-    }
-    if (!result && d->dweight) {
-        const int64_t shape[2] = {in, d->rows};
-        const gsf_nn_tensor x = gsf_nn_wrap_tensor(NULL, scratch, 2, shape);
-        gsf__nn_transpose(ctx, d->x, GSF_NN_F32, d->rows, in, d->ldx ? d->ldx : in, scratch);
-        gsf__nn_transpose(ctx, d->dy, GSF_NN_F32, d->rows, out, out, scratch + inner);
-        memset(&multiply, 0, sizeof multiply);
-        multiply.x = scratch + inner;
         multiply.rows = out;
+        multiply.transposed_x = 1;
         multiply.weight = &x;
+        multiply.transposed_weight = 1;
+        multiply.ldw = d->ldx;
         multiply.accumulate = 1;
         multiply.y = d->dweight;
-        result = gsf__nn_run_linear(ctx, NULL, &multiply);
+        GSF__TRY(gsf__nn_run_linear(ctx, workspace, &multiply));
     }
-    gsf_free(ctx, scratch);
-    return !result && d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, d->rows, out, d->dbias) : result;
+    return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, d->rows, out, d->dbias) : GSF_OK;
 }
 
 // ---- training: attention
@@ -19858,9 +19872,10 @@ typedef struct gsf__dit_train {
 } gsf__dit_train;
 
 // y = x (w + scale b a)^T: with u = scale x a^T, db = dy^T u; with du = scale dy b, da = du^T x
-static gsf_result gsf__dit_lora_grad(const gsf__dit_train* t, const gsf__lora_pair* p, const float* x, int64_t rows,
+static gsf_result gsf__dit_lora_grad(gsf__dit_train* t, const gsf__lora_pair* p, const float* x, int64_t rows,
                                      const float* dy) {
     gsf_context* ctx = t->run.nn.ctx;
+    gsf__nn_workspace* workspace = &t->run.nn.workspace;
     const int64_t count = rows * p->a->shape[0];
     gsf__nn_linear_desc down;
     gsf__nn_linear_grad_desc d;
@@ -19872,7 +19887,7 @@ static gsf_result gsf__dit_lora_grad(const gsf__dit_train* t, const gsf__lora_pa
     down.rows = rows;
     down.weight = p->a;
     down.y = u;
-    gsf_result result = gsf__nn_run_linear(ctx, NULL, &down);
+    gsf_result result = gsf__nn_run_linear(ctx, workspace, &down);
     for (int64_t i = 0; i < count; i++) u[i] *= p->scale;
     memset(&d, 0, sizeof d);
     d.x = u;
@@ -19881,19 +19896,19 @@ static gsf_result gsf__dit_lora_grad(const gsf__dit_train* t, const gsf__lora_pa
     d.dy = dy;
     d.dx = du;
     d.dweight = gsf__nn_grad_of(t->params, p->b);
-    if (!result) result = gsf__nn_linear_grad(ctx, &d);
+    if (!result) result = gsf__nn_linear_grad(ctx, workspace, &d);
     for (int64_t i = 0; i < count; i++) du[i] *= p->scale;
     d.x = x;
     d.weight = p->a;
     d.dy = du;
     d.dx = NULL;
     d.dweight = gsf__nn_grad_of(t->params, p->a);
-    if (!result) result = gsf__nn_linear_grad(ctx, &d);
+    if (!result) result = gsf__nn_linear_grad(ctx, workspace, &d);
     gsf_free(ctx, u);
     return result;
 }
 
-static gsf_result gsf__dit_linear_grad(const gsf__dit_train* t, const gsf__nn_layer* layer, const float* x, int64_t rows,
+static gsf_result gsf__dit_linear_grad(gsf__dit_train* t, const gsf__nn_layer* layer, const float* x, int64_t rows,
                                        const float* dy, float* dx, int accumulate) {
     gsf__nn_linear_grad_desc d;
     memset(&d, 0, sizeof d);
@@ -19907,7 +19922,7 @@ static gsf_result gsf__dit_linear_grad(const gsf__dit_train* t, const gsf__nn_la
     d.dbias = gsf__nn_grad_of(t->params, layer->bias);
     for (size_t i = 0; t->lora && i < t->lora->count; i++)
         if (t->lora->pairs[i].weight == layer->weight) GSF__TRY(gsf__dit_lora_grad(t, &t->lora->pairs[i], x, rows, dy));
-    return dx || d.dweight || d.dbias ? gsf__nn_linear_grad(t->run.nn.ctx, &d) : GSF_OK;
+    return dx || d.dweight || d.dbias ? gsf__nn_linear_grad(t->run.nn.ctx, &t->run.nn.workspace, &d) : GSF_OK;
 }
 
 // scale, dscale, dshift NULL: a norm without modulation

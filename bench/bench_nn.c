@@ -854,7 +854,7 @@ typedef struct bench_gradient { // of one layer; unused ones are zero
 static void bench_run_gradient(gsf_context* ctx, void* arg) {
     const bench_gradient* g = (const bench_gradient*)arg;
     if (g->attention.q) bench_require(ctx, gsf__nn_attention_grad(ctx, &g->attention_grad));
-    else if (g->linear.x) bench_require(ctx, gsf__nn_linear_grad(ctx, &g->linear));
+    else if (g->linear.x) bench_require(ctx, gsf__nn_linear_grad(ctx, NULL, &g->linear));
     else bench_require(ctx, gsf__nn_conv_grad(ctx, &g->conv_grad));
 }
 

@@ -82,7 +82,7 @@ static gsf_result backward(gsf_context* ctx, const made_layer* m) {
         const gsf_nn_tensor weight = gsf_nn_wrap_tensor("weight", v[1], 2, shape);
         float* dx = m->gap ? NULL : m->grad; // with a gap only the weights' gradients
         const gsf__nn_linear_grad_desc d = {v[0], m->rows, m->in + m->gap, &weight, m->dy, dx, 0, g[1], g[2]};
-        return gsf__nn_linear_grad(ctx, &d);
+        return gsf__nn_linear_grad(ctx, NULL, &d);
     }
     if (m->kind == NORM) {
         const int o = m->option;
