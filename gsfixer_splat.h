@@ -12410,6 +12410,7 @@ typedef struct gsf__carry_reference {
     float* residual; // (H,W,3): colour - render; NULL without renders
     float* depth;    // (H,W), 0 = no surface
     uint8_t* score;  // (H,W), percent
+    uint8_t* links;  // (H,W): GSF__CARRY_UPPER, GSF__CARRY_LOWER: triangles of the surface below and right of a pixel
 } gsf__carry_reference;
 
 typedef struct gsf__carry_study { // of one photo
@@ -12437,6 +12438,8 @@ enum {
     GSF__CARRY_ALIKE = 50,     // percent: likeness from which windows of two photos show the same
     GSF__CARRY_WINDOW = 3,     // radius of the windows that are compared between photos
     GSF__CARRY_BAND = 16,      // rows of a frame that are drawn together
+    GSF__CARRY_UPPER = 1,      // pixels (0,0), (1,0), (0,1) from here lie on one surface
+    GSF__CARRY_LOWER = 2,      // pixels (1,0), (1,1), (0,1)
     GSF__CARRY_OTHERS = 8,     // most references that judge another one
     GSF__CARRY_LEVELS = 6,     // of the pyramid that corrects the splats' depth
     GSF__CARRY_SLOTS = 9,      // most references that are ranked
@@ -12451,6 +12454,7 @@ static void gsf__carrier_close(gsf_context* ctx, gsf__carrier* carrier) {
         gsf_free(ctx, ref->residual);
         gsf_free(ctx, ref->depth);
         gsf_free(ctx, ref->score);
+        gsf_free(ctx, ref->links);
     }
     gsf_free(ctx, carrier->references);
     gsf_free(ctx, carrier->inv_z);
@@ -12816,7 +12820,8 @@ static gsf_result gsf__carry_take(gsf_context* ctx, const gsf_reference* from, i
     ref->residual = has_residuals ? (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float)) : NULL;
     ref->depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
     ref->score = (uint8_t*)gsf_alloc_zeroed(ctx, pixels, 1);
-    if (!ref->bytes || !ref->color || (has_residuals && !ref->residual) || !ref->depth || !ref->score)
+    ref->links = (uint8_t*)gsf_alloc_zeroed(ctx, pixels, 1);
+    if (!ref->bytes || !ref->color || (has_residuals && !ref->residual) || !ref->depth || !ref->score || !ref->links)
         return GSF_ERROR_OUT_OF_MEMORY;
     const gsf_image color = gsf_wrap_image(ref->color, GSF_F32, width, height, 3);
     const gsf_image bytes = gsf_wrap_image(ref->bytes, GSF_U8, width, height, 3);
@@ -12960,6 +12965,23 @@ static void gsf__carry_score_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
+static int gsf__carry_connected(float a, float b, float c) {
+    const float ab = a < b ? a : b, lo = ab < c ? ab : c, over_ab = a < b ? b : a, hi = over_ab < c ? c : over_ab;
+    return lo > 0.0f && hi <= lo * GSF__CARRY_EDGE;
+}
+
+static void gsf__carry_link_row(void* arg, size_t row, int32_t worker) { // all rows but the last
+    (void)worker;
+    const gsf__carry_score_job* job = (const gsf__carry_score_job*)arg;
+    const gsf__carry_reference* ref = job->carrier->references + job->reference;
+    const size_t width = (size_t)ref->camera.width;
+    const float *depth = ref->depth + row * width, *below = depth + width;
+    for (size_t x = 0; x + 1 < width; x++)
+        ref->links[row * width + x] =
+            (uint8_t)((gsf__carry_connected(depth[x], depth[x + 1], below[x]) ? GSF__CARRY_UPPER : 0) |
+                      (gsf__carry_connected(depth[x + 1], below[x + 1], below[x]) ? GSF__CARRY_LOWER : 0));
+}
+
 // Corrects the splats' depth where stereo is silent by the ratio of both around it: the log of the ratio is averaged in a
 // pyramid of sums, and every pixel takes it from the finest level that has evidence.
 static gsf_result gsf__carry_correct(gsf_context* ctx, gsf__carry_reference* ref, const float* confirmed) {
@@ -13079,6 +13101,7 @@ static gsf_result gsf__carrier_score(gsf_context* ctx, gsf__carrier* carrier) {
             gsf__parallel_for(ctx, rows, gsf__carry_judge_row, &job);
         }
         gsf__parallel_for(ctx, rows, gsf__carry_score_row, &job);
+        gsf__parallel_for(ctx, rows - 1, gsf__carry_link_row, &job);
     }
     gsf__arena_free(&arena);
     return result;
@@ -13101,22 +13124,33 @@ static gsf_result gsf__carrier_take(gsf_context* ctx, gsf__carrier* carrier, con
 // ---- one frame
 
 typedef struct gsf__carry_vertex { float u, v, inv_z; } gsf__carry_vertex; // inv_z 0: no surface
-typedef struct gsf__carry_span { float lo, hi; } gsf__carry_span;          // of the v of a row of vertices
+typedef struct gsf__carry_span { float lo, hi; } gsf__carry_span;          // of u or v
+
+static gsf__carry_span gsf__carry_span_of(float a, float b, float c) {
+    const gsf__carry_span ab = {a < b ? a : b, a < b ? b : a}, all = {ab.lo < c ? ab.lo : c, ab.hi < c ? c : ab.hi};
+    return all;
+}
+
+// Pixels whose centres lie in lo..hi, and those that are less than 0.01 off.
+static void gsf__carry_range(float lo, float hi, int32_t begin, int32_t end, int32_t* first, int32_t* last) {
+    *first = lo > (float)begin + 0.51f ? (int32_t)(lo + 0.49f) : begin;
+    *last = hi < (float)end - 0.51f ? (int32_t)(hi + 0.51f) - 1 : end - 1;
+}
 
 // Rasterizes a triangle of inverse depths into the rows begin..end-1 of the z-buffer (the largest inverse depth wins).
 // Triangles that face away or are stretched over more than 32 pixels are skipped: they are not a surface that the
 // reference saw.
 static void gsf__carry_triangle(const gsf__carry_vertex* a, const gsf__carry_vertex* b, const gsf__carry_vertex* c,
                                 float* inv_z, int32_t width, int32_t begin, int32_t end) {
+    const gsf__carry_span v = gsf__carry_span_of(a->v, b->v, c->v);
+    if (!(v.hi > (float)begin && v.lo < (float)end)) return;
+    const gsf__carry_span u = gsf__carry_span_of(a->u, b->u, c->u);
+    if (!(u.hi > 0.0f && u.lo < (float)width) || u.hi - u.lo > 32.0f || v.hi - v.lo > 32.0f) return;
     const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
     if (!(area > 1e-6f)) return;
-    const float lo_u = fminf(a->u, fminf(b->u, c->u)), hi_u = fmaxf(a->u, fmaxf(b->u, c->u));
-    const float lo_v = fminf(a->v, fminf(b->v, c->v)), hi_v = fmaxf(a->v, fmaxf(b->v, c->v));
-    if (!(hi_u > 0.0f && hi_v > (float)begin && lo_u < (float)width && lo_v < (float)end)) return;
-    if (hi_u - lo_u > 32.0f || hi_v - lo_v > 32.0f) return;
-    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1;
-    const int32_t y0 = lo_v < (float)begin + 0.5f ? begin : (int32_t)(lo_v - 0.5f);
-    const int32_t y1 = hi_v < (float)end ? (int32_t)hi_v : end - 1;
+    int32_t x0, x1, y0, y1;
+    gsf__carry_range(u.lo, u.hi, 0, width, &x0, &x1);
+    gsf__carry_range(v.lo, v.hi, begin, end, &y0, &y1);
     const float scale = 1.0f / area;
     for (int32_t y = y0; y <= y1; y++)
         for (int32_t x = x0; x <= x1; x++) {
@@ -13131,16 +13165,11 @@ static void gsf__carry_triangle(const gsf__carry_vertex* a, const gsf__carry_ver
         }
 }
 
-static int gsf__carry_connected(float a, float b, float c) {
-    const float lo = fminf(a, fminf(b, c)), hi = fmaxf(a, fmaxf(b, c));
-    return lo > 0.0f && hi <= lo * GSF__CARRY_EDGE;
-}
-
 typedef struct gsf__carry_draw_job {
     const gsf__carry_reference* ref;
     const gsf_camera* camera;    // of the frame
     gsf__carry_vertex* vertices; // (H,W) of the reference
-    gsf__carry_span* spans;      // (H)
+    gsf__carry_span* spans;      // (H), of the v of a row of vertices
     float* inv_z;                // (H,W) of the frame
 } gsf__carry_draw_job;
 
@@ -13161,8 +13190,8 @@ static void gsf__carry_vertex_row(void* arg, size_t row, int32_t worker) {
         vertices[x].u = (float)u;
         vertices[x].v = (float)v;
         vertices[x].inv_z = (float)(1.0 / z);
-        span.lo = fminf(span.lo, vertices[x].v);
-        span.hi = fmaxf(span.hi, vertices[x].v);
+        if (vertices[x].v < span.lo) span.lo = vertices[x].v;
+        if (vertices[x].v > span.hi) span.hi = vertices[x].v;
     }
     job->spans[row] = span;
 }
@@ -13172,18 +13201,17 @@ static void gsf__carry_draw_band(void* arg, size_t band, int32_t worker) {
     const gsf__carry_draw_job* job = (const gsf__carry_draw_job*)arg;
     const int32_t width = job->ref->camera.width, begin = (int32_t)band * GSF__CARRY_BAND;
     const int32_t end = begin + GSF__CARRY_BAND < job->camera->height ? begin + GSF__CARRY_BAND : job->camera->height;
-    for (int32_t y = 1; y < job->ref->camera.height; y++) {
-        const gsf__carry_span *up = job->spans + y - 1, *down = job->spans + y;
-        if (!(fmaxf(up->hi, down->hi) > (float)begin && fminf(up->lo, down->lo) < (float)end)) continue;
-        const gsf__carry_vertex* above = job->vertices + (size_t)(y - 1) * (size_t)width;
-        const gsf__carry_vertex* now = above + width;
-        const float *depth_above = job->ref->depth + (size_t)(y - 1) * (size_t)width, *depth = depth_above + width;
+    for (int32_t y = 0; y + 1 < job->ref->camera.height; y++) {
+        const gsf__carry_span *up = job->spans + y, *down = up + 1;
+        if (!((up->hi > (float)begin || down->hi > (float)begin) && (up->lo < (float)end || down->lo < (float)end))) continue;
+        const gsf__carry_vertex *above = job->vertices + (size_t)y * (size_t)width, *below = above + width;
+        const uint8_t* links = job->ref->links + (size_t)y * (size_t)width;
         for (int32_t x = 0; x + 1 < width; x++) {
-            const gsf__carry_vertex *a = above + x, *b = above + x + 1, *c = now + x, *d = now + x + 1;
-            if (!(b->inv_z > 0.0f && c->inv_z > 0.0f)) continue; // both triangles have them
-            if (a->inv_z > 0.0f && gsf__carry_connected(depth_above[x], depth_above[x + 1], depth[x]))
+            const gsf__carry_vertex *a = above + x, *b = a + 1, *c = below + x, *d = c + 1;
+            if (!links[x] || !(b->inv_z > 0.0f && c->inv_z > 0.0f)) continue; // both triangles have them
+            if ((links[x] & GSF__CARRY_UPPER) && a->inv_z > 0.0f)
                 gsf__carry_triangle(a, b, c, job->inv_z, job->camera->width, begin, end);
-            if (d->inv_z > 0.0f && gsf__carry_connected(depth_above[x + 1], depth[x + 1], depth[x]))
+            if ((links[x] & GSF__CARRY_LOWER) && d->inv_z > 0.0f)
                 gsf__carry_triangle(b, d, c, job->inv_z, job->camera->width, begin, end);
         }
     }

@@ -683,7 +683,7 @@ static void bench_training(const bench_options* o) {
     desc.iterations = 30000;
     desc.sh_interval = 1; // all bands from the first step
     desc.densify_until = -1;
-    desc.opacity_reset_interval = 1 << 30;
+    desc.opacity_reset_interval = -1;
     gsf_trainer* trainer;
     bench_require(&ctx, gsf_splat_make_trainer(&ctx, &desc, views, count, &start, &trainer));
 
