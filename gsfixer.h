@@ -462,6 +462,8 @@ typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
     // A restorer sets what follows only if struct_size covers it.
     int32_t needs_carried;          // references per frame that it asks for with carry_fn; 0 = none
     float lambda;                   // preferred weight of its frames in training, used by default; 0: no preference
+    int32_t lambda_views;           // photos for which that weight is meant; the default falls with more of them, as
+                                    // lambda_views / photos. 0: the same for any number
 } gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on

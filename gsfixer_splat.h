@@ -616,11 +616,11 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_resto
 // ---- the repair loop -----------------------------------------------------------
 /* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
    frames, and continue training on photos and repaired frames: L = L_recon + lambda * L_gen. The frames of a new round
-   replace the old ones. A frame covers a photo's full field of view. If the restorer asks for it
-   (limits.squash), it is rendered at the restorer's own size, with fx and fy scaled independently, and trained on with
-   that camera; otherwise pixels stay square, the frame may lack or add a margin, and pixels beyond the photo's field of
-   view are not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at
-   any time.
+   replace the old ones. A weight below 1 is reached by steps without a repaired frame, which cost half as much. A frame
+   covers a photo's full field of view. If the restorer asks for it (limits.squash), it is rendered at the restorer's own
+   size, with fx and fy scaled independently, and trained on with that camera; otherwise pixels stay square, the frame may
+   lack or add a margin, and pixels beyond the photo's field of view are not trained on. The loop is a state machine that
+   the host steps, so it can show, cancel, checkpoint or stop at any time.
        gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
 typedef struct gsf_fix_desc {
@@ -643,7 +643,7 @@ typedef struct gsf_fix_desc {
     int32_t window_frames;        // 0 = the restorer's preferred count, else 17; changed to the nearest count that it
                                   // accepts
     float lambda;                 // weight of the restored views at the end of training, default what the restorer
-                                  // prefers, or 1; negative = 0
+                                  // prefers for this many photos, or 1; negative = 0
     float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
                                   // pixels that the references explain; 0 = never skip
     int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
@@ -656,7 +656,7 @@ typedef enum gsf_fix_stage { GSF_FIX_TRAIN = 0, GSF_FIX_PLAN, GSF_FIX_RESTORE, G
 typedef struct gsf_fix_stats { // what the last step did
     gsf_fix_stage stage;
     gsf_train_stats train;            // TRAIN: of this step, else zero
-    float lambda;
+    float lambda;                     // TRAIN: weight of the restored views, in the mean of the steps around this one
     int32_t round, rounds;            // 1-based round being planned or restored
     int32_t window, windows;          // likewise
     int32_t skipped;                  // windows skipped so far
@@ -13421,7 +13421,10 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     (void)ctx;
     out->needs_depth = 1;
     out->explains = 1;
-    if (out->struct_size >= sizeof *out) out->needs_carried = GSF__WARP_NEAREST;
+    if (out->struct_size >= sizeof *out) {
+        out->needs_carried = GSF__WARP_NEAREST;
+        out->lambda_views = 3; // the more the photos show, the less it adds to them: measured in bench/QUALITY.md
+    }
     const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
     const int32_t drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
     out->bytes = (double)width * height * (20.0 * count + 4.0 * drawn + 12.0);
@@ -14009,7 +14012,11 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     if (!f->cameras) result = GSF_ERROR_OUT_OF_MEMORY;
     for (; f->cameras && f->view_count < view_count; f->view_count++) f->cameras[f->view_count] = views[f->view_count].camera;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
-    if (desc->lambda == 0.0f && f->limits.lambda > 0.0f && f->limits.lambda <= 1e6f) f->desc.lambda = f->limits.lambda;
+    if (desc->lambda == 0.0f) {
+        const float few = (float)f->limits.lambda_views;
+        if (f->limits.lambda > 0.0f && f->limits.lambda <= 1e6f) f->desc.lambda = f->limits.lambda;
+        if (few > 0.0f && (float)view_count > few) f->desc.lambda *= few / (float)view_count;
+    }
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
         result = gsf_splat_make_warp(ctx, &f->explain);
@@ -14032,6 +14039,14 @@ GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer) { return fixe
 static float gsf__restored_weight(const gsf_fixer* f) {
     return (float)gsf_traj_query_generative_weight(f->trainer->iteration, f->desc.first_round, f->desc.train.iterations,
                                                    (double)f->desc.lambda, 0);
+}
+
+// That weight in the coming step: the larger of 1 and desc.lambda in as many steps as make up for those without restored
+// views, which cost nothing. Multiples of the golden ratio spread them evenly.
+static float gsf__restored_step_weight(const gsf_fixer* f, float weight) {
+    const float full = f->desc.lambda > 1.0f ? f->desc.lambda : 1.0f;
+    const double turns = 0.6180339887498949 * (double)f->trainer->iteration;
+    return turns - floor(turns) < (double)(weight / full) ? full : 0.0f;
 }
 
 static int gsf__round_is_due(const gsf_fixer* f) {
@@ -14404,7 +14419,7 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
         stats->stage = GSF_FIX_TRAIN;
         gsf__close_references(ctx, f); // which gsf_splat_restore_views has left open
         stats->lambda = f->trainer->restored.count ? gsf__restored_weight(f) : 0.0f;
-        gsf_splat_set_restored_weight(f->trainer, stats->lambda);
+        gsf_splat_set_restored_weight(f->trainer, gsf__restored_step_weight(f, stats->lambda));
         GSF__TRY(gsf_splat_step_trainer(ctx, f->trainer, &stats->train));
     }
     stats->skipped = f->skipped;

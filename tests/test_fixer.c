@@ -324,6 +324,8 @@ static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int
     out->width_max = r->also.width_max;
     out->height_max = r->also.height_max;
     out->squash = r->also.squash;
+    out->lambda = r->also.lambda;
+    out->lambda_views = r->also.lambda_views;
     out->needs_depth = out->needs_alpha = 1;
     return GSF_OK;
 }
@@ -536,6 +538,14 @@ static void test_desc(gsf_context* ctx) { // the loop's desc with defaults fille
     CHECK(used.train.extent > 1.0f && used.train.extent < 4.0f &&
           used.train.render.near_plane == 0.01f * used.train.extent);
     gsf_splat_destroy_fixer(ctx, fixer);
+    for (int views = 0; views <= VIEWS + 1; views++) { // the restorer's weight, made for that many photos
+        r.also.lambda = views % 2 ? 2.0f : 0.0f;
+        r.also.lambda_views = views;
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
+        const float share = views == 0 || views > VIEWS ? 1.0f : (float)views / (float)VIEWS;
+        CHECK_NEAR(gsf_splat_get_fixer_desc(fixer).lambda, (views % 2 ? 2.0f : 1.0f) * share, 1e-6);
+        gsf_splat_destroy_fixer(ctx, fixer);
+    }
     given.lambda = -1.0f; // 0
     given.train.iterations = 150; // only one iteration is just before a densification, so rounds stay separate
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));

@@ -28,6 +28,33 @@ static void test_restored_weight(void) {
     CHECK_NEAR(gsf__restored_weight(&fixer), 0.6, 1e-7);
 }
 
+// A step's weight is 0 or the full one, and in every stretch of 100 steps their mean is the scheduled weight.
+static void test_restored_step_weight(void) {
+    static const float lambdas[] = {0.3f, 1.0f, 2.0f};
+    gsf_trainer trainer;
+    gsf_fixer fixer;
+    memset(&trainer, 0, sizeof trainer);
+    memset(&fixer, 0, sizeof fixer);
+    fixer.trainer = &trainer;
+    for (size_t i = 0; i < GSF__COUNT(lambdas); i++) {
+        const float full = lambdas[i] > 1.0f ? lambdas[i] : 1.0f;
+        fixer.desc.lambda = lambdas[i];
+        for (int part = 0; part <= 20; part++) {
+            const float weight = lambdas[i] * (float)part / 20.0f;
+            for (int32_t first = 0; first < 30000; first += 4999) {
+                double sum = 0.0;
+                for (trainer.iteration = first; trainer.iteration < first + 100; trainer.iteration++) {
+                    const float step = gsf__restored_step_weight(&fixer, weight);
+                    CHECK(step == 0.0f || step == full);
+                    sum += (double)step;
+                }
+                CHECK_NEAR(sum / 100.0, (double)weight, 0.03 * (double)full);
+                if (part == 0 || weight == full) CHECK(sum == 100.0 * (double)weight);
+            }
+        }
+    }
+}
+
 // ---- densification -------------------------------------------------------------
 
 static gsf__model make_model(gsf_context* ctx, size_t count) {
@@ -197,6 +224,7 @@ int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
     test_restored_weight();
+    test_restored_step_weight();
     test_densify_means(&ctx);
     test_visits(&ctx);
     test_origin();
