@@ -4,6 +4,9 @@
 
 #include <math.h>
 #include <stddef.h>
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
 
 // ---- defaults --------------------------------------------------------------------
 
@@ -832,6 +835,9 @@ static gsf_result meet_checkpoint(fix_run* run) {
 
 // Training continues if a checkpoint cannot be written; the last good one stays in place.
 static void keep_checkpoint(fix_run* run) {
+#ifdef __GLIBC__
+    malloc_trim(0); // what a round has freed; otherwise the checkpoint's buffer comes on top of it
+#endif
     const gsf_result result = save_checkpoint(run);
     if (result != GSF_OK && !run->checkpoint_failed)
         gsfix_note(run->app, "warning: no checkpoint at step %d, going on without: %s", (int)run->iteration,
