@@ -616,11 +616,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_resto
 // ---- the repair loop -----------------------------------------------------------
 /* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
    frames, and continue training on photos and repaired frames: L = L_recon + lambda * L_gen. The frames of a new round
-   replace the old ones. A weight below 1 is reached by steps without a repaired frame, which cost half as much. A frame
-   covers a photo's full field of view. If the restorer asks for it (limits.squash), it is rendered at the restorer's own
-   size, with fx and fy scaled independently, and trained on with that camera; otherwise pixels stay square, the frame may
-   lack or add a margin, and pixels beyond the photo's field of view are not trained on. The loop is a state machine that
-   the host steps, so it can show, cancel, checkpoint or stop at any time.
+   replace the old ones. Where the weight is below the larger of 1 and lambda, repaired frames have that one, in as many
+   steps as make up for those without, which cost half as much. A frame covers a photo's full field of view. If the restorer
+   asks for it (limits.squash), it is rendered at the restorer's own size, with fx and fy scaled independently, and trained
+   on with that camera; otherwise pixels stay square, the frame may lack or add a margin, and pixels beyond the photo's
+   field of view are not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or
+   stop at any time.
        gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
 typedef struct gsf_fix_desc {

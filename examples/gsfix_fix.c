@@ -602,10 +602,10 @@ static gsf_result save_checkpoint(fix_run* run) {
 
 // Decides whether to write a checkpoint at a point where one may be written; the result of the run does not depend on it.
 // Together with the next one and the last, which is always written, checkpoints take less than 2 % of the elapsed time.
-// Within a round, whose frames take much memory, one is written at most every five minutes.
+// Within a round, whose frames take much memory, one is written at most every minute.
 static int checkpoint_pays(const fix_run* run, int within_round) {
     const double now = gsfix_now();
-    return now - run->checkpoint_end >= (within_round ? 300.0 : 1.0) &&
+    return now - run->checkpoint_end >= (within_round ? 60.0 : 1.0) &&
            run->checkpoint_sum + 2.0 * run->checkpoint_last <= 0.02 * (now - run->app->started);
 }
 
