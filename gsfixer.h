@@ -464,6 +464,8 @@ typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
     float lambda;                   // preferred weight of its frames in training, used by default; 0: no preference
     int32_t lambda_views;           // photos for which that weight is meant; the default falls with more of them, as
                                     // lambda_views / photos. 0: the same for any number
+    float frame_scale;              // preferred sides of the frames to train on, as a share of the photos', used by default
+                                    // unless `squash` is set; 0: as large as the photos
 } gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on

@@ -617,11 +617,11 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_resto
 /* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
    frames, and continue training on photos and repaired frames: L = L_recon + lambda * L_gen. The frames of a new round
    replace the old ones. Where the weight is below the larger of 1 and lambda, repaired frames have that one, in as many
-   steps as make up for those without, which cost half as much. A frame covers a photo's full field of view. If the restorer
-   asks for it (limits.squash), it is rendered at the restorer's own size, with fx and fy scaled independently, and trained
-   on with that camera; otherwise pixels stay square, the frame may lack or add a margin, and pixels beyond the photo's
-   field of view are not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or
-   stop at any time.
+   steps as make up for those without, which cost half as much. A frame covers a photo's full field of view, in pixels of a
+   size of its own (frame_scale, max_pixels). If the restorer asks for it (limits.squash), it is rendered at the restorer's
+   own size, with fx and fy scaled independently, and trained on with that camera; otherwise pixels stay square, the frame
+   may lack or add a margin, and pixels beyond the photo's field of view are not trained on. The loop is a state machine that
+   the host steps, so it can show, cancel, checkpoint or stop at any time.
        gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
 typedef struct gsf_fix_desc {
@@ -647,8 +647,10 @@ typedef struct gsf_fix_desc {
                                   // prefers for this many photos, or 1; negative = 0
     float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
                                   // pixels that the references explain; 0 = never skip
+    float frame_scale;            // sides of the frames as a share of the photos', at most 1, default what the restorer
+                                  // prefers, or 1. Not used if the restorer has a frame size of its own (limits.squash)
     int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
-                                  // accepts smaller ones; 0 = the restorer's own size, or the photos'
+                                  // accepts smaller ones; 0 = no limit
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -13414,6 +13416,7 @@ typedef struct gsf__warp {
 #define GSF__WARP_BEHIND_MAX 2.0f
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
+enum { GSF__WARP_HALVED = 128 };        // photos of at least this many pixels a side are repaired at half their size
 enum { GSF__WARP_FEW = 6 };             // with fewer photos, verified colours replace the render everywhere
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -13425,6 +13428,8 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     if (out->struct_size >= sizeof *out) {
         out->needs_carried = GSF__WARP_NEAREST;
         out->lambda_views = 3; // the more the photos show, the less it adds to them: measured in bench/QUALITY.md
+        // What it carries is off by more than a pixel anyway, and the photos show all detail.
+        if (width >= GSF__WARP_HALVED && height >= GSF__WARP_HALVED) out->frame_scale = 0.5f;
     }
     const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
     const int32_t drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
@@ -13846,6 +13851,7 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     }
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     d.lambda = gsf__or_zero(d.lambda, 1.0f);
+    if (d.frame_scale == 0.0f) d.frame_scale = 1.0f;
     return d;
 }
 
@@ -13856,9 +13862,12 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (d->windows < 1 || d->windows > 4096 || (d->window_frames && (d->window_frames < 3 || d->window_frames > 4096)))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid %d windows of %d frames", (int)d->windows,
                         (int)d->window_frames);
-    if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f) || d->max_pixels < 0)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid lambda %g, skip_psnr %g or max_pixels %d",
-                        (double)d->lambda, (double)d->skip_psnr, (int)d->max_pixels);
+    if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid lambda %g or skip_psnr %g", (double)d->lambda,
+                        (double)d->skip_psnr);
+    if (!(d->frame_scale > 0.0f && d->frame_scale <= 1.0f) || d->max_pixels < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid frame_scale %g or max_pixels %d",
+                        (double)d->frame_scale, (int)d->max_pixels);
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
@@ -13907,8 +13916,8 @@ static gsf_camera gsf__squashed_camera(const gsf_fixer* f, const gsf_camera* cam
 static double gsf__square_size(const gsf_fixer* f, int32_t width, int32_t height, int32_t* frame_width,
                                int32_t* frame_height) {
     const gsf_restorer_info* limits = &f->limits;
-    double scale = 1.0;
-    if (limits->width_max > 0 && width > limits->width_max) scale = (double)limits->width_max / width;
+    double scale = (double)f->desc.frame_scale;
+    if (limits->width_max > 0 && width * scale > limits->width_max) scale = (double)limits->width_max / width;
     if (limits->height_max > 0 && height * scale > limits->height_max) scale = (double)limits->height_max / height;
     if (f->desc.max_pixels > 0 && width * scale * height * scale > f->desc.max_pixels)
         scale = sqrt((double)f->desc.max_pixels / ((double)width * height));
@@ -14013,6 +14022,8 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     if (!f->cameras) result = GSF_ERROR_OUT_OF_MEMORY;
     for (; f->cameras && f->view_count < view_count; f->view_count++) f->cameras[f->view_count] = views[f->view_count].camera;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
+    if (desc->frame_scale == 0.0f && f->limits.frame_scale > 0.0f && f->limits.frame_scale <= 1.0f)
+        f->desc.frame_scale = f->limits.frame_scale;
     if (desc->lambda == 0.0f) {
         const float few = (float)f->limits.lambda_views;
         if (f->limits.lambda > 0.0f && f->limits.lambda <= 1e6f) f->desc.lambda = f->limits.lambda;
@@ -14043,7 +14054,8 @@ static float gsf__restored_weight(const gsf_fixer* f) {
 }
 
 // That weight in the coming step: the larger of 1 and desc.lambda in as many steps as make up for those without restored
-// views, which cost nothing. Multiples of the golden ratio spread them evenly.
+// views, which cost nothing. Multiples of the golden ratio spread them evenly. (With twice that weight in half as many steps
+// `warp` gains the same, but a perfect restorer much less.)
 static float gsf__restored_step_weight(const gsf_fixer* f, float weight) {
     const float full = f->desc.lambda > 1.0f ? f->desc.lambda : 1.0f;
     const double turns = 0.6180339887498949 * (double)f->trainer->iteration;

@@ -79,6 +79,13 @@ static void test_warp(gsf_context* ctx) {
     one_frame frame;
     one_frame_init(&frame, &cameras[2], gray, out_color, out_confidence);
     CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
+    for (int32_t side = 127; side <= 129; side++) { // large photos are repaired at half their size
+        gsf_restorer_info info;
+        memset(&info, 0, sizeof info);
+        info.struct_size = sizeof info;
+        CHECK_OK(ctx, warp.query_fn(warp.user, ctx, 17, side, 500, &info));
+        CHECK(info.frame_scale == (side < 128 ? 0.0f : 0.5f));
+    }
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
     CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     int covered = 0;
@@ -326,6 +333,7 @@ static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int
     out->squash = r->also.squash;
     out->lambda = r->also.lambda;
     out->lambda_views = r->also.lambda_views;
+    out->frame_scale = r->also.frame_scale;
     out->needs_depth = out->needs_alpha = 1;
     return GSF_OK;
 }
@@ -789,27 +797,30 @@ static void test_given_path(gsf_context* ctx) {
 
 // Restorers trained for 13 frames of 96 x 40, with photos of 48 x 40. Kind 0 squashes the photos to the frame; 1 does so
 // at a lower pixel limit, as --quality fast sets; 2 and 3 need square pixels in frames of one size, half of which is margin
-// and excluded from training.
+// and excluded from training; 4 prefers frames of half the photos' size, 5 too, but the host wants them whole.
 static void test_native_frames(gsf_context* ctx) {
     static repair r;
     gsf_fixer* fixer;
     gsf_fix_stats stats;
-    for (int kind = 0; kind < 4; kind++) {
+    for (int kind = 0; kind < 6; kind++) {
         repair_setup(ctx, &r);
         gsf_fix_desc desc = repair_desc();
         desc.window_frames = 0;
         desc.train.iterations = 90;
         desc.rounds = 1;
-        r.multiple = kind == 3 ? 1 : 8;
+        r.multiple = kind >= 3 ? 1 : 8;
         r.also.frame_count = r.also.frame_count_max = 13;
         r.also.width = 96;
         r.also.height = 40;
         r.also.squash = kind < 2;
         if (kind == 1) desc.max_pixels = 1100; // an exact fit would be 51 x 21
         if (kind >= 2) r.also.width_max = 96, r.also.height_max = 40;
+        if (kind >= 4) r.also.frame_scale = 0.5f;
+        if (kind == 5) desc.frame_scale = 1.0f;
         if (kind == 2) r.multiple = 40, r.also.width_max = 120, desc.max_pixels = 100; // would shrink photos to a corner
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
         CHECK(gsf_splat_get_fixer_desc(fixer).window_frames == 13);
+        CHECK(gsf_splat_get_fixer_desc(fixer).frame_scale == (kind == 4 ? 0.5f : 1.0f));
         int windows = 0, wrong = 0;
         for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE;) {
             if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) break;
@@ -820,7 +831,8 @@ static void test_native_frames(gsf_context* ctx) {
             if (kind == 0) CHECK(c->width == 96 && c->height == 40);
             if (kind == 1) CHECK(c->width == 48 && c->height == 24);
             if (kind == 2) CHECK(c->width == 40 && c->height == 40);
-            if (kind == 3) CHECK(c->width == 48 && c->height == 40 && c->fx == r.views[0].camera.fx);
+            if (kind == 3 || kind == 5) CHECK(c->width == 48 && c->height == 40 && c->fx == r.views[0].camera.fx);
+            if (kind == 4) CHECK(c->width == 24 && c->height == 20 && c->fx == 0.5 * r.views[0].camera.fx);
             const float reach = 0.5f * (float)WIDTH * (float)(c->fx / r.views[0].camera.fx);
             const float rise = 0.5f * (float)HEIGHT * (float)(c->fy / r.views[0].camera.fy);
             for (int y = 0; y < c->height; y++)
@@ -883,6 +895,12 @@ static void test_trouble(gsf_context* ctx) {
     desc.first_round = 1000;
     CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
                  GSF_ERROR_INVALID_ARGUMENT);
+    for (int i = 0; i < 3; i++) {
+        desc = repair_desc();
+        desc.frame_scale = i == 0 ? -0.5f : i == 1 ? 1.01f : NAN;
+        CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
+                     GSF_ERROR_INVALID_ARGUMENT);
+    }
     desc = repair_desc();
     r.restorer.end_fn = NULL;
     CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
