@@ -30,8 +30,8 @@ def rounds(options, args, times):
             run(program, args, options.cpu, times)
 
 
-def ratio(options, row):
-    return min(row[options.new]) / min(row[options.old]) if len(row) == 2 else 0.0
+def ratio(options, row):  # 0: not in both, or too short for the clock
+    return min(row[options.new]) / min(row[options.old]) if len(row) == 2 and min(row[options.old]) > 0.0 else 0.0
 
 
 def main():
