@@ -13428,7 +13428,7 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     if (out->struct_size >= sizeof *out) {
         out->needs_carried = GSF__WARP_NEAREST;
         out->lambda_views = 3; // the more the photos show, the less it adds to them: measured in bench/QUALITY.md
-        // What it carries is off by more than a pixel anyway, and the photos show all detail.
+        // Whole frames cost twice as much and gain the same; the photos show all detail. Measured in bench/QUALITY.md
         if (width >= GSF__WARP_HALVED && height >= GSF__WARP_HALVED) out->frame_scale = 0.5f;
     }
     const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
