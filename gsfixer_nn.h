@@ -3503,10 +3503,7 @@ GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const flo
     const gsf__norm_vectors by = job->by;
     const int64_t dim = job->dim;
     int64_t i = 0;
-    for (; i + GSF__LANES <= dim; i += GSF__LANES) {
-        gsf__v_fetch(x + dim + i); // the next row
-        gsf__v_put(y + i, gsf__norm_value(by, &n, x, i, GSF__LANES), stream);
-    }
+    for (; i + GSF__LANES <= dim; i += GSF__LANES) gsf__v_put(y + i, gsf__norm_value(by, &n, x, i, GSF__LANES), stream);
     if (i < dim) gsf__v_store_first(y + i, gsf__norm_value(by, &n, x, i, (size_t)(dim - i)), (size_t)(dim - i));
 }
 
@@ -3844,7 +3841,7 @@ static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
 // The number of rows of the GEMV kernel that handles `rows` rows.
 static int64_t gsf__gemv_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__GEMV_ROWS; }
 
-static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
+GSF__ALWAYS_INLINE static inline float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight at any address
     float value;
     uint16_t bits;
     if (dtype == GSF_NN_F32) {
@@ -3857,13 +3854,21 @@ static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f3
 
 // ---- linear: scalar kernels
 
+GSF__ALWAYS_INLINE static inline void gsf__pack_corner_as(const char* w, gsf_nn_dtype dtype, size_t size, size_t pitch,
+                                                          int64_t columns, int64_t k, int64_t count, float* out) {
+    for (int64_t c = 0; c < columns; c++, w += pitch)
+        for (int64_t i = k; i < count; i++)
+            out[i * GSF__TILE_COLUMNS + c] = gsf__nn_load(w + (size_t)i * size, dtype);
+}
+
 // Packs the part of a panel from step k and column `first` on.
 static void gsf__pack_corner(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t first, int64_t columns, int64_t k,
                              int64_t count, float* out) {
-    const size_t size = gsf_nn_get_dtype_size(dtype);
-    for (int64_t c = first; c < first + columns; c++)
-        for (int64_t i = k; i < count; i++)
-            out[i * GSF__TILE_COLUMNS + c] = gsf__nn_load(w + (size_t)c * pitch + (size_t)i * size, dtype);
+    w += (size_t)first * pitch;
+    out += first;
+    if (dtype == GSF_NN_F32) gsf__pack_corner_as(w, GSF_NN_F32, 4, pitch, columns, k, count, out);
+    else if (dtype == GSF_NN_BF16) gsf__pack_corner_as(w, GSF_NN_BF16, 2, pitch, columns, k, count, out);
+    else gsf__pack_corner_as(w, GSF_NN_F16, 2, pitch, columns, k, count, out);
 }
 
 static void gsf__pack_weights_scalar(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count,

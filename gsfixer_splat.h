@@ -13427,7 +13427,10 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     out->explains = 1;
     if (out->struct_size >= sizeof *out) {
         out->needs_carried = GSF__WARP_NEAREST;
-        out->lambda_views = 3; // the more the photos show, the less it adds to them: measured in bench/QUALITY.md
+        // Weight 1 gains no more, but leaves some scenes below those without repair. More photos show more, so that repair
+        // adds less to them. Measured in bench/QUALITY.md
+        out->lambda = 0.5f;
+        out->lambda_views = 6;
         // Whole frames cost twice as much and gain the same; the photos show all detail. Measured in bench/QUALITY.md
         if (width >= GSF__WARP_HALVED && height >= GSF__WARP_HALVED) out->frame_scale = 0.5f;
     }

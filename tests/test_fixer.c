@@ -85,6 +85,7 @@ static void test_warp(gsf_context* ctx) {
         info.struct_size = sizeof info;
         CHECK_OK(ctx, warp.query_fn(warp.user, ctx, 17, side, 500, &info));
         CHECK(info.frame_scale == (side < 128 ? 0.0f : 0.5f));
+        CHECK(info.lambda == 0.5f && info.lambda_views == 6);
     }
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
     CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
