@@ -9899,6 +9899,13 @@ typedef struct gsf__loss_kernels {
     void (*gradient)(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
                      const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
                      float* d_render);
+    // Of two rows of `count` pixels, each t[p] and t[q] the first value of its first pixel (t: f32, or else u8): per pixel
+    // the sum over RGB of |t_p - t_q|. differences: room for 3 count rounded up to whole vectors.
+    void (*contrast)(const float* f32, const uint8_t* u8, size_t p, size_t q, size_t count, float* differences, float* out);
+    // Per pixel e |a - b| with e = 1 / (1 + (scale contrast)^2), which is added to the sum, and its derivative with
+    // respect to a; 0 where a or b is negative, which is no depth.
+    void (*smooth)(const float* a, const float* b, const float* contrast, float scale, size_t count, float* slope,
+                   double* sum);
 } gsf__loss_kernels;
 
 static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) : 0.0f; } // NaN: 0
@@ -10026,6 +10033,39 @@ GSF__V_KERNEL void GSF__V(gsf__loss_gradient)(const float* sums, size_t sums_ste
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__loss_contrast)(const float* f32, const uint8_t* u8, size_t p, size_t q, size_t count,
+                                              float* differences, float* out) {
+    for (size_t i = 0; i < 3 * count; i += GSF__LANES) {
+        const size_t left = 3 * count - i;
+        const gsf__vf a = u8 ? gsf__v_load_bytes(u8 + p + i, left) : gsf__v_load_first(f32 + p + i, left);
+        const gsf__vf b = u8 ? gsf__v_load_bytes(u8 + q + i, left) : gsf__v_load_first(f32 + q + i, left);
+        gsf__v_store(differences + i, gsf__v_abs(a - b));
+    }
+    for (size_t x = 0; x < count; x += GSF__LANES) {
+        const gsf__vi pixel = gsf__vi_min(gsf__vi_index(), gsf__vi_set((int32_t)(count - 1 - x)));
+        const gsf__vi at = gsf__vi_mul(pixel, gsf__vi_set(3));
+        const float* d = differences + 3 * x;
+        const gsf__vf sum = (gsf__v_gather(d, at) + gsf__v_gather(d + 1, at)) + gsf__v_gather(d + 2, at);
+        gsf__v_store_first(out + x, sum, count - x);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__loss_smooth)(const float* a, const float* b, const float* contrast, float scale,
+                                            size_t count, float* slope, double* sum) {
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f), by = gsf__v_set(scale);
+    gsf__vd total = gsf__vd_set(0.0);
+    for (size_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = count - i;
+        const gsf__vf p = gsf__v_load_first(a + i, left), q = gsf__v_load_first(b + i, left), difference = p - q;
+        const gsf__vf d = by * gsf__v_load_first(contrast + i, left), edge = one / (one + d * d);
+        gsf__vm counts = gsf__vm_and(gsf__v_ge(p, zero), gsf__v_ge(q, zero));
+        counts = gsf__vm_and(counts, gsf__vm_not(gsf__v_eq(difference, zero)));
+        gsf__v_store_first(slope + i, gsf__v_keep(counts, gsf__v_with_sign(edge, difference)), left);
+        total = gsf__vd_add_folded(total, gsf__v_keep(counts, edge * gsf__v_abs(difference)));
+    }
+    *sum += gsf__vd_sum(total);
+}
+
 #endif // GSF__KERNELS_LOSS
 #ifndef GSF__ISA
 
@@ -10098,7 +10138,9 @@ static void gsf__loss_across_simd128(const float* v, size_t n, float* sums) {
 static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
     const gsf__loss_kernels kernels = {GSF__ANY_KERNEL_OF(level, gsf__loss_load), GSF__ANY_KERNEL_OF(level, gsf__loss_down),
                                        GSF__ANY_KERNEL_OF(level, gsf__loss_across), GSF__ANY_KERNEL_OF(level, gsf__loss_map),
-                                       GSF__ANY_KERNEL_OF(level, gsf__loss_gradient)};
+                                       GSF__ANY_KERNEL_OF(level, gsf__loss_gradient),
+                                       GSF__ANY_KERNEL_OF(level, gsf__loss_contrast),
+                                       GSF__ANY_KERNEL_OF(level, gsf__loss_smooth)};
     return kernels;
 }
 
@@ -10347,29 +10389,13 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
 // mean over RGB. Pairs in which a pixel has no depth are left out. Writes the gradient to d_depth (H,W). `scratch` must
 // be as gsf__loss left it for this photo.
 typedef struct gsf__smooth_job {
+    gsf__loss_kernels k;
     const gsf__target* target;
     const float* depth;
     float* d_depth;
     gsf__loss_scratch* scratch;
     float extent, factor;
 } gsf__smooth_job;
-
-// e_pq for two pixels.
-static float gsf__smooth_edge(const gsf__target* target, size_t p, size_t q) {
-    const float *f = target->f32, scale = (f ? 1.0f : 1.0f / 255.0f) * (10.0f / 3.0f);
-    float d = 0.0f;
-    for (size_t c = 0; c < 3; c++)
-        d += f ? fabsf(f[3 * p + c] - f[3 * q + c]) : fabsf((float)(target->u8[3 * p + c] - target->u8[3 * q + c]));
-    return 1.0f / (1.0f + scale * d * (scale * d));
-}
-
-// e_pq |a - b| is added to the sum; returns its derivative with respect to a, where a and b are D_p and D_q, or -1: none.
-static float gsf__smooth_pair(const gsf__target* target, size_t p, size_t q, float a, float b, double* sum) {
-    if (!(a >= 0.0f && b >= 0.0f)) return 0.0f;
-    const float diff = a - b, edge = gsf__smooth_edge(target, p, q);
-    *sum += (double)(edge * fabsf(diff));
-    return diff > 0.0f ? edge : diff < 0.0f ? -edge : 0.0f;
-}
 
 static void gsf__smooth_row(const gsf__smooth_job* job, int32_t y, float* nearness) {
     const size_t width = (size_t)job->target->width, at = (size_t)y * width;
@@ -10379,32 +10405,46 @@ static void gsf__smooth_row(const gsf__smooth_job* job, int32_t y, float* nearne
     }
 }
 
+// Slopes of `count` pairs of pixels whose nearness is in a and b; the first are the pixels p and q of the photo.
+static void gsf__smooth_pairs(const gsf__smooth_job* job, const gsf__loss_buffers* b, size_t p, size_t q, size_t count,
+                              const float* of_p, const float* of_q, float* slope, double* sum) {
+    const gsf__target* t = job->target;
+    const float scale = (t->f32 ? 1.0f : 1.0f / 255.0f) * (10.0f / 3.0f);
+    float* contrast = b->outside;
+    if (count == 0) return;
+    job->k.contrast(t->f32, t->u8, 3 * p, 3 * q, count, b->render, contrast);
+    job->k.smooth(of_p, of_q, contrast, scale, count, slope, sum);
+}
+
 // Each pair is computed once: the derivative with respect to the one pixel is minus that with respect to the other.
 static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
     const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
-    const size_t width = (size_t)job->target->width;
-    const gsf__loss_buffers b = gsf__loss_buffers_of(job->scratch->rows, gsf__loss_row(job->target->width),
-                                                     job->target->height, band, worker);
-    float *here = b.weight, *below = here + width, *down = below + width; // down: derivatives at the row above
+    const size_t width = (size_t)job->target->width, row = gsf__loss_row(job->target->width);
+    const gsf__loss_buffers b = gsf__loss_buffers_of(job->scratch->rows, row, job->target->height, band, worker);
+    float *here = b.weight, *below = here + width, *right = below + width; // right: slopes of pairs in the row
+    float *up = b.middle[0], *down = b.middle[1];                          // slopes of those with the rows above and below
     double sum = 0.0, of_band_above = 0.0;
     int32_t y = b.first > 0 ? b.first - 1 : 0; // pairs with the band above belong to that band's sum
     gsf__smooth_row(job, y, here);
+    memset(up, 0, width * sizeof *up);
     memset(down, 0, width * sizeof *down);
+    right[width - 1] = 0.0f;
     for (; y < b.end; y++) {
+        const size_t at = (size_t)y * width;
         double* to = y < b.first ? &of_band_above : &sum;
-        float right = 0.0f;
         gsf__smooth_row(job, y + 1, below);
-        for (size_t x = 0; x < width; x++) {
-            const size_t at = (size_t)y * width + x;
-            const float left = right, up = down[x], z = job->depth[at];
-            right = x + 1 < width ? gsf__smooth_pair(job->target, at, at + 1, here[x], here[x + 1], to) : 0.0f;
-            down[x] = gsf__smooth_pair(job->target, at, at + width, here[x], below[x], to);
-            if (y >= b.first) // dD/dz = -extent / z^2
-                job->d_depth[at] = z > 0.0f ? -job->factor * (right + down[x] - left - up) * here[x] / z : 0.0f;
+        gsf__smooth_pairs(job, &b, at, at + 1, width - 1, here, here + 1, right, to);
+        if (y + 1 < job->target->height) gsf__smooth_pairs(job, &b, at, at + width, width, here, below, down, to);
+        else memset(down, 0, width * sizeof *down);
+        for (size_t x = 0; x < width && y >= b.first; x++) { // dD/dz = -extent / z^2
+            const float left = x > 0 ? right[x - 1] : 0.0f, z = job->depth[at + x];
+            job->d_depth[at + x] = z > 0.0f ? -job->factor * (right[x] + down[x] - left - up[x]) * here[x] / z : 0.0f;
         }
-        float* next = here;
+        float *const next = here, *const above = up;
         here = below;
         below = next;
+        up = down;
+        down = above;
     }
     job->scratch->sums[band] = sum;
 }
@@ -10412,6 +10452,7 @@ static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
 static double gsf__depth_smoothness(gsf_context* ctx, gsf__loss_scratch* scratch, const gsf__target* target,
                                     const float* depth, float extent, float weight, float* d_depth) {
     gsf__smooth_job job;
+    job.k = gsf__loss_kernels_of(ctx->cpu_level);
     job.target = target;
     job.depth = depth;
     job.d_depth = d_depth;

@@ -287,6 +287,54 @@ static void test_smoothness_derivative(gsf_context* ctx) {
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
 
+// The gradient has the same bits at every level, also for odd widths, and that of bytes is that of the same floats.
+static void test_smoothness_levels(gsf_cpu_level last) {
+    enum { W = 37, H = 5 };
+    float floats[3 * W * H], render[3 * W * H], ignored[3 * W * H], depth[W * H], scalar[2][W * H], d[W * H];
+    uint8_t bytes[3 * W * H];
+    uint64_t state = 31;
+    for (int i = 0; i < 3 * W * H; i++) {
+        bytes[i] = (uint8_t)(256.0 * test_random(&state));
+        floats[i] = render[i] = (float)bytes[i] / 255.0f;
+    }
+    for (int i = 0; i < W * H; i++) depth[i] = i % 11 == 3 ? 0.0f : i % 11 == 4 ? 2.0f : 1.0f + (float)test_random(&state);
+    for (int32_t width = 1; width <= W; width += 6)
+        for (int level = GSF_CPU_SCALAR; level <= (int)last; level++) {
+            double sums[2];
+            for (int u8 = 0; u8 < 2; u8++) {
+                gsf_context ctx = open_context((gsf_cpu_level)level, NULL);
+                gsf__loss_scratch scratch;
+                gsf__target target;
+                gsf__loss_value value;
+                memset(&scratch, 0, sizeof scratch);
+                memset(&target, 0, sizeof target);
+                target.width = width;
+                target.height = H;
+                if (u8) target.u8 = bytes;
+                else target.f32 = floats;
+                CHECK_OK(&ctx, gsf__loss(&ctx, &scratch, &target, render, 0.2f, 1.0f, ignored, &value));
+                sums[u8] = gsf__depth_smoothness(&ctx, &scratch, &target, depth, 2.0f, 0.7f, d);
+                if (level == GSF_CPU_SCALAR) memcpy(scalar[u8], d, sizeof d);
+                CHECK(!memcmp(d, scalar[u8], (size_t)(width * H) * sizeof(float)));
+                for (int i = 0; u8 && i < width * H; i++) CHECK_NEAR(d[i], scalar[0][i], 1e-5 * (1e-3 + fabs(scalar[0][i])));
+                gsf__loss_destroy_scratch(&ctx, &scratch);
+            }
+            double exact = 0.0; // as documented, over all pairs
+            for (int p = 0; p < width * H; p++)
+                for (int k = 0; k < 2; k++) {
+                    const int q = k ? p + width : p + 1;
+                    if (k ? q >= width * H : q % width == 0) continue;
+                    if (depth[p] == 0.0f || depth[q] == 0.0f) continue;
+                    double mean = 0.0;
+                    for (int c = 0; c < 3; c++) mean += fabs((double)bytes[3 * p + c] - (double)bytes[3 * q + c]) / 765.0;
+                    exact += fabs(2.0 / (double)depth[p] - 2.0 / (double)depth[q]) / (1.0 + 100.0 * mean * mean);
+                }
+            exact *= 0.7 / (width * H);
+            CHECK_NEAR(sums[0], exact, 1e-6 * exact);
+            CHECK_NEAR(sums[1], exact, 1e-6 * exact);
+        }
+}
+
 // ---- Adam and regularisers on a bare model ---------------------------------------
 
 static gsf__model make_small_model(gsf_context* ctx, size_t count, int32_t sh_degree) {
@@ -1933,6 +1981,7 @@ int main(void) {
     for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_SIMD128; level++) test_loss_accuracy((gsf_cpu_level)level);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_loss_weights((gsf_cpu_level)level);
     test_smoothness_derivative(&ctx);
+    test_smoothness_levels(ctx.cpu_level);
     test_adam_rejects(&ctx);
     test_adam_bands(&ctx);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) {
