@@ -3459,13 +3459,16 @@ GSF__V_INLINE void gsf__moments_add(gsf__moments_sums* m, gsf__vd d0, gsf__vd d1
     m->square1 = gsf__vd_madd(d1, d1, m->square1);
 }
 
-GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t count, int centre) {
+// With `ahead` the values after these are prefetched meanwhile: the next row.
+GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t count, int centre, int ahead) {
     const int64_t half = GSF__LANES / GSF__HALVES;
     const float pivot = centre && count > 0 ? x[0] : 0.0f;
     const gsf__vd p = gsf__vd_set((double)pivot), zero = gsf__vd_set(0.0);
     gsf__moments_sums m = {zero, zero, zero, zero}, n = m;
     int64_t i = 0;
     for (; i + 4 * half <= count; i += 4 * half) {
+        if (ahead) gsf__v_fetch(x + count + i);
+        if (ahead && GSF__LANES == 16) gsf__v_fetch(x + count + i + 2 * half);
         gsf__moments_add(&m, gsf__vd_load(x + i) - p, gsf__vd_load(x + i + half) - p);
         gsf__moments_add(&n, gsf__vd_load(x + i + 2 * half) - p, gsf__vd_load(x + i + 3 * half) - p);
     }
@@ -3483,7 +3486,7 @@ GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t coun
 }
 
 GSF__V_KERNEL gsf__moments GSF__V(gsf__moments)(const float* x, int64_t count, int centre) {
-    return GSF__V(gsf__moments_all)(x, count, centre);
+    return GSF__V(gsf__moments_all)(x, count, centre, 0);
 }
 
 // Normalises the `left` values from x[i] on; in loops over whole vectors `left` is a constant.
@@ -3498,7 +3501,7 @@ GSF__V_INLINE gsf__vf gsf__norm_value(gsf__norm_vectors by, const gsf__norm_term
 }
 
 GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const float* x, float* y, int stream) {
-    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
+    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre, 1);
     const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
     const gsf__norm_vectors by = job->by;
     const int64_t dim = job->dim;
@@ -3514,7 +3517,7 @@ GSF__V_KERNEL void GSF__V(gsf__norm_row)(const gsf__norm_job* job, const float* 
 }
 
 GSF__V_KERNEL void GSF__V(gsf__norm_head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
+    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre, 0);
     const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
     const gsf__norm_vectors by = job->by;
     const int64_t dim = job->dim;
