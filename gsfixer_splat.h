@@ -9899,11 +9899,11 @@ typedef struct gsf__loss_kernels {
     void (*gradient)(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
                      const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
                      float* d_render);
-    // Of two rows of `count` pixels, each t[p] and t[q] the first value of its first pixel (t: f32, or else u8): per pixel
-    // the sum over RGB of |t_p - t_q|. differences: room for 3 count rounded up to whole vectors.
+    // Computes the sums over RGB of |t[p + i] - t[q + i]| for `count` pixels of a photo t, f32 or, if that is NULL, u8; p
+    // and q are the offsets of the first pixels' values. differences: room for 3 `count`, rounded up to whole vectors.
     void (*contrast)(const float* f32, const uint8_t* u8, size_t p, size_t q, size_t count, float* differences, float* out);
-    // Per pixel e |a - b| with e = 1 / (1 + (scale contrast)^2), which is added to the sum, and its derivative with
-    // respect to a; 0 where a or b is negative, which is no depth.
+    // Computes the derivative of e |a - b| with respect to a, e = 1 / (1 + (scale contrast)^2), and adds e |a - b| to the
+    // sum. Pixels where a or b is negative have no depth: both are 0.
     void (*smooth)(const float* a, const float* b, const float* contrast, float scale, size_t count, float* slope,
                    double* sum);
 } gsf__loss_kernels;
@@ -10405,7 +10405,7 @@ static void gsf__smooth_row(const gsf__smooth_job* job, int32_t y, float* nearne
     }
 }
 
-// Slopes of `count` pairs of pixels whose nearness is in a and b; the first are the pixels p and q of the photo.
+// Slopes of `count` pairs of pixels, from p and q of the photo on; of_p and of_q are their nearness, D.
 static void gsf__smooth_pairs(const gsf__smooth_job* job, const gsf__loss_buffers* b, size_t p, size_t q, size_t count,
                               const float* of_p, const float* of_q, float* slope, double* sum) {
     const gsf__target* t = job->target;
