@@ -83,8 +83,8 @@
                unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
                tokens, positions, latents.
    WHERE TO ADD
-       a restorer       gsf_restorer under "restorer interface": struct_size and the four functions from query_fn to
-                        end_fn. query_fn runs before begin_fn, and for every clip of gsf_restore_clip, so it changes
+       a restorer       gsf_restorer under "restorer interface": struct_size, the four functions from query_fn to
+                        end_fn and, if there is something to release, destroy_fn. query_fn runs before begin_fn, and for every clip of gsf_restore_clip, so it changes
                         nothing; begin_fn and end_fn run once per round. restore_fn writes every pixel of out_color and
                         out_confidence, which are undefined before. If query_fn sets needs_carried, restore_fn may
                         ask window->carry_fn (unless NULL, or beyond struct_size) for the photos as they appear in a

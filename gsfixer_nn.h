@@ -55,6 +55,7 @@
                         GSF__NN_ACTIVATION_COUNT, beside the enum, and activation_of in tests/activation.h
        a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
                         of >>nn layers
+       a restorer       gsf_nn_make_NAME in a section like >>nn mini; what gsfixer_splat.h says of built-in ones holds here
        a solver         gsf_nn_solver, in >>nn scheduler
    SECTIONS    files      >>nn kernels (types) >>nn numbers >>nn workspace >>nn files: safetensors, PyTorch, config.json
                lanes      >>nn vector

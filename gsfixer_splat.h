@@ -67,8 +67,9 @@
                         the condition under which they run. With lazy_adam, they must not write gradients of SH.
                         On the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass. Terms are
                         multiplied by `scale` and added to d_color after gsf__loss; gsf__depth_smoothness overwrites
-                        d_depth, so that a second depth term adds to it afterwards. New image buffers:
-                        gsf__trainer_reserve_images, gsf_splat_destroy_trainer.
+                        d_depth, so that a second depth term adds to it afterwards. Depth is only rendered and
+                        backpropagated if `smooth` is set there. New image buffers: gsf__trainer_reserve_images,
+                        gsf_splat_destroy_trainer.
                         Tests: test_regularisers, busy_desc and the bad values in tests/test_trainer.c; the names in
                         tests/test_gsfix.sh
        a camera model   a row of gsf__lens_models in >>colmap, at the index that is COLMAP's model id; its parameters are
@@ -76,14 +77,14 @@
                         gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (unless it is a pinhole
                         with all zeros) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
                         gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind and the names of parameters,
-                        gsf__transforms_keys. The list at gsf_splat_load_scene. Tests: reference_distort and
+                        gsf__transforms_keys, in the order of gsf__transforms_add_camera. The list at gsf_splat_load_scene. Tests: reference_distort and
                         test_lenses, which counts through the ids (17 is refused), in tests/test_scene.c
        a file format    gsf_splat_type, a reader and a writer in >>formats
        a restorer       the host's own: fill in a gsf_restorer (gsfixer.h, "restorer interface"); gsf__open_references and
-                        gsf__restore_or_skip in >>fixer make the calls. A built-in one: gsf_splat_make_NAME and
-                        _destroy_NAME, declared under "restorers", in a section like >>warp; in examples/gsfix.c the
-                        help of --restorer, gsfix_check_restorer, gsfix_make_restorer, gsfix_destroy_restorer (`none` is
-                        NULL) and, if `gsfix restore` can lack its inputs, a check like check_warp_clip. The list in
+                        gsf__restore_or_skip in >>fixer make the calls. A built-in one: gsf_splat_make_NAME,
+                        declared under "restorers", in a section like >>warp; its destroy_fn releases what it made. In
+                        examples/gsfix.c the help of --restorer, gsfix_check_restorer, gsfix_make_restorer and, if
+                        `gsfix restore` can lack its inputs, a check like check_warp_clip. The list in
                         README.md. Tests: tests/test_fixer.c, tests/test_gsfix.sh
        what photos show in a frame    a member of gsf_carried (gsfixer.h), its place in gsf__list_carried, and in >>carry
                         gsf__carry_row, which fills it in. What makes a pixel more or less certain: gsf__carry_score_row.
