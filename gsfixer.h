@@ -84,11 +84,12 @@
                tokens, positions, latents.
    WHERE TO ADD
        a restorer       gsf_restorer under "restorer interface": struct_size, the four functions from query_fn to
-                        end_fn and, if there is something to release, destroy_fn. query_fn runs before begin_fn, and for every clip of gsf_restore_clip, so it changes
-                        nothing; begin_fn and end_fn run once per round. restore_fn writes every pixel of out_color and
-                        out_confidence, which are undefined before. If query_fn sets needs_carried, restore_fn may
-                        ask window->carry_fn (unless NULL, or beyond struct_size) for the photos as they appear in a
-                        frame. gsf_splat_make_warp in gsfixer_splat.h is an example
+                        end_fn and, if there is something to release, destroy_fn. query_fn runs before begin_fn, and
+                        for every clip of gsf_restore_clip, so it changes nothing; begin_fn and end_fn run once per
+                        round. restore_fn writes every pixel of out_color and out_confidence, which are undefined
+                        before. If query_fn sets needs_carried, restore_fn may ask window->carry_fn (unless NULL, or
+                        beyond struct_size) for the photos as they appear in a frame. gsf_splat_make_warp in
+                        gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
    SECTIONS    >>glm >>internals >>maths >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate

@@ -77,8 +77,9 @@
                         gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (unless it is a pinhole
                         with all zeros) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
                         gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind and the names of parameters,
-                        gsf__transforms_keys, in the order of gsf__transforms_add_camera. The list at gsf_splat_load_scene. Tests: reference_distort and
-                        test_lenses, which counts through the ids (17 is refused), in tests/test_scene.c
+                        gsf__transforms_keys, in the order of gsf__transforms_add_camera. The list at
+                        gsf_splat_load_scene. Tests: reference_distort and test_lenses, which counts through the ids (17
+                        is refused), in tests/test_scene.c
        a file format    gsf_splat_type, a reader and a writer in >>formats
        a restorer       the host's own: fill in a gsf_restorer (gsfixer.h, "restorer interface"); gsf__open_references and
                         gsf__restore_or_skip in >>fixer make the calls. A built-in one: gsf_splat_make_NAME,
