@@ -13442,6 +13442,8 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
                    do not yet explain; it is added to the render.
        floaters    A residual would keep a floater: where two references look through the surface that the frame shows and
                    none sees it there, the colours are taken even so.
+       hidden      What references show far behind the surface of the frame is most likely hidden by it, unless one of them
+                   looks through that surface: the render is kept. Not so with few photos, whose splats are no evidence.
    Blending is weighted by score and angle; confidence falls where the candidates disagree. Pixels that no reference
    reaches keep the render and get confidence 0, so that they are not trained on.
    In the repair loop it shares the loop's carrier; elsewhere it makes one of its own from the references. If a reference has
@@ -13457,6 +13459,8 @@ typedef struct gsf__warp {
 #define GSF__WARP_TRUST 0.5f            // total weight below which a residual is attenuated
 #define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
 #define GSF__WARP_BEHIND_MAX 2.0f
+#define GSF__WARP_HIDDEN 1.1f           // depth ratio from which a warped surface may be hidden by the frame's
+#define GSF__WARP_OPAQUE 0.5f           // alpha from which the frame's surface hides others
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
 enum { GSF__WARP_HALVED = 128 };        // photos of at least this many pixels a side are repaired at half their size
@@ -13467,6 +13471,7 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     const gsf__warp* warp = (const gsf__warp*)user;
     (void)ctx;
     out->needs_depth = 1;
+    out->needs_alpha = 1;
     out->explains = 1;
     if (out->struct_size >= sizeof *out) {
         out->needs_carried = GSF__WARP_NEAREST;
@@ -13555,9 +13560,9 @@ typedef struct gsf__warp_job {
     int near_count;
 } gsf__warp_job;
 
-// Returns 1 if the surface that the frame shows at camera depth `z` is a floater: at least two references look through
-// it, and none shows a surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges).
-static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z) {
+// Returns how many references look through the surface that the frame shows at camera depth `z`: 0 if one of them shows a
+// surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges). Two make it a floater.
+static int gsf__warp_count_through(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z) {
     int through = 0;
     double point[3], u, v, depth;
     gsf__unproject(camera, x + 0.5, y + 0.5, z, point);
@@ -13575,7 +13580,7 @@ static int gsf__warp_refutes(const gsf__warp_job* job, const gsf_camera* camera,
         }
         through += behind == 9;
     }
-    return through >= 2;
+    return through;
 }
 
 typedef struct gsf__warp_candidate {
@@ -13602,9 +13607,9 @@ static float gsf__warp_front(const gsf__warp_candidate* candidates, int count) {
 }
 
 // Restores one pixel, whose render is rgb at depth `shown`, from the references. Returns the confidence; if no
-// reference reaches the pixel, returns 0 and leaves rgb unchanged.
+// reference reaches the pixel, or what they show is hidden there, returns 0 and leaves rgb unchanged.
 static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, const float* inv_z,
-                             size_t plane, float shown, float rgb[3]) {
+                             size_t plane, float shown, int opaque, float rgb[3]) {
     gsf__warp_candidate candidates[GSF__WARP_NEAREST];
     int count = 0, verified = 0;
     for (int k = 0; k < job->near_count; k++) {
@@ -13621,10 +13626,13 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     for (int i = 0; i < count; i++)
         verified |= fabsf(candidates[i].sample.depth - front) <= GSF__CARRY_DEPTH_TOLERANCE * front &&
                     candidates[i].sample.score >= 0.01f * (float)GSF__CARRY_VERIFIED;
-    const int behind = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
-    const int refuted = !verified && behind && gsf__warp_refutes(job, camera, x, y, (double)shown);
-    const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
     const int few = job->carrier->count < GSF__WARP_FEW;
+    const int behind = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
+    const int hidden = !few && opaque && shown > 0.0f && front > shown * GSF__WARP_HIDDEN;
+    const int through = hidden || (!verified && behind) ? gsf__warp_count_through(job, camera, x, y, (double)shown) : 0;
+    if (hidden && through == 0) return 0.0f;
+    const int refuted = !verified && behind && through >= 2;
+    const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
     const int colors = refuted || (verified && (few || !agrees)) || !job->carrier->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
@@ -13668,8 +13676,9 @@ static void gsf__warp_row(void* arg, size_t row, int32_t worker) {
             for (size_t c = 0; c < 3 && weight > 0.0f; c++) rgb[c] = inside ? gsf__photo_color(ref, c, &taps) : 0.0f;
         } else {
             const float shown = window->depth ? gsf__get_pixel(window->depth + job->frame, x, y, 0) : 0.0f;
+            const int opaque = !window->alpha || gsf__get_pixel(window->alpha + job->frame, x, y, 0) >= GSF__WARP_OPAQUE;
             weight = gsf__warp_pixel(job, camera, x, y, job->carrier->inv_z + row * (size_t)camera->width + (size_t)x, plane,
-                                     shown, rgb);
+                                     shown, opaque, rgb);
         }
         for (int c = 0; c < 3; c++) gsf__put_pixel(window->out_color + job->frame, x, y, c, rgb[c]);
         gsf__put_pixel(window->out_confidence + job->frame, x, y, 0, weight);

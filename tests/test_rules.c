@@ -143,46 +143,87 @@ static void test_origin(void) {
 
 // ---- warp ----------------------------------------------------------------------
 
-enum { SIDE = 8, PIXELS = SIDE * SIDE };
+enum { SIDE = 16, PIXELS = SIDE * SIDE };
+
+// A frame of SIDE pixels at the origin, `count` references that are moved by `shift` to the right, and the photos and
+// depths of the first two, which are red and green.
+typedef struct warp_case {
+    float color[2][3 * PIXELS], depth[2][PIXELS], inv_z[2 * PIXELS];
+    uint8_t score[2][PIXELS];
+    gsf__carry_reference references[8];
+    gsf__carrier carrier;
+    gsf__warp_job job;
+    gsf_camera camera;
+} warp_case;
+
+static void warp_case_init(warp_case* w, int count, double shift, const float depth[2], const int percent[2]) {
+    memset(w, 0, sizeof *w);
+    w->camera.w2c[0] = w->camera.w2c[5] = w->camera.w2c[10] = w->camera.w2c[15] = 1.0;
+    w->camera.width = w->camera.height = SIDE;
+    w->camera.fx = w->camera.fy = SIDE;
+    w->camera.cx = w->camera.cy = SIDE / 2.0;
+    for (int k = 0; k < 2; k++) {
+        gsf__carry_reference* reference = w->references + k;
+        reference->camera = w->camera;
+        reference->camera.w2c[12] = -shift;
+        reference->center[0] = shift;
+        reference->color = w->color[k];
+        reference->depth = w->depth[k];
+        reference->score = w->score[k];
+        for (int i = 0; i < PIXELS; i++) {
+            for (int c = 0; c < 3; c++) w->color[k][3 * i + c] = c == k ? 1.0f : 0.0f;
+            w->depth[k][i] = depth[k];
+            w->score[k][i] = (uint8_t)percent[k];
+            w->inv_z[k * PIXELS + i] = 1.0f / depth[k];
+        }
+    }
+    w->carrier.references = w->references;
+    w->carrier.count = count;
+    w->job.near_count = 2;
+    w->job.carrier = &w->carrier;
+    w->job.nearest[1] = 1;
+}
+
+static float warp_middle(const warp_case* w, float shown, int opaque, float rgb[3]) {
+    const int32_t x = SIDE / 2, y = SIDE / 2;
+    return gsf__warp_pixel(&w->job, &w->camera, x, y, w->inv_z + y * SIDE + x, PIXELS, shown, opaque, rgb);
+}
 
 // Two references at the frame's own position show red at depth 1 and green at depth 2, with the given scores. The
 // nearer surface is shown if it has at least 0.35 of the farther one's weight.
 static int warp_shows_near(int near_percent, int far_percent) {
-    static float color[2][3 * PIXELS], depth[2][PIXELS], inv_z[2 * PIXELS];
-    static uint8_t score[2][PIXELS];
-    gsf__carry_reference references[2];
-    gsf__carrier carrier;
-    gsf__warp_job job;
-    gsf_camera camera;
-    memset(references, 0, sizeof references);
-    memset(&carrier, 0, sizeof carrier);
-    memset(&job, 0, sizeof job);
-    memset(&camera, 0, sizeof camera);
-    camera.w2c[0] = camera.w2c[5] = camera.w2c[10] = camera.w2c[15] = 1.0;
-    camera.width = camera.height = SIDE;
-    camera.fx = camera.fy = SIDE;
-    camera.cx = camera.cy = SIDE / 2.0;
-    for (int k = 0; k < 2; k++) {
-        references[k].camera = camera;
-        references[k].color = color[k];
-        references[k].depth = depth[k];
-        references[k].score = score[k];
-        for (int i = 0; i < PIXELS; i++) {
-            for (int c = 0; c < 3; c++) color[k][3 * i + c] = c == k ? 1.0f : 0.0f;
-            depth[k][i] = (float)(k + 1);
-            score[k][i] = (uint8_t)(k == 0 ? near_percent : far_percent);
-            inv_z[k * PIXELS + i] = 1.0f / (float)(k + 1);
-        }
-    }
-    carrier.references = references;
-    carrier.count = job.near_count = 2;
-    job.carrier = &carrier;
-    job.nearest[1] = 1;
-    const int32_t x = SIDE / 2, y = SIDE / 2;
+    static warp_case w;
+    const float depth[2] = {1.0f, 2.0f};
+    const int percent[2] = {near_percent, far_percent};
+    warp_case_init(&w, 2, 0.0, depth, percent);
     float rgb[3] = {0.0f, 0.0f, 0.0f};
-    const float confidence = gsf__warp_pixel(&job, &camera, x, y, inv_z + y * SIDE + x, PIXELS, 5.0f, rgb);
+    const float confidence = warp_middle(&w, 5.0f, 1, rgb);
     CHECK(confidence > 0.0f && rgb[0] + rgb[1] > 0.99f && rgb[0] * rgb[1] < 1e-3f);
     return rgb[0] > 0.5f;
+}
+
+// References moved by `shift` show red and green at depth 1, the frame grey at depth `shown`. Returns whether the grey stays,
+// then with confidence 0.
+static int warp_keeps(int count, double shift, float shown, int opaque) {
+    static warp_case w;
+    const float depth[2] = {1.0f, 1.0f};
+    const int percent[2] = {100, 100};
+    warp_case_init(&w, count, shift, depth, percent);
+    float rgb[3] = {0.2f, 0.2f, 0.2f};
+    const float confidence = warp_middle(&w, shown, opaque, rgb);
+    const int kept = rgb[0] == 0.2f && rgb[1] == 0.2f && rgb[2] == 0.2f;
+    CHECK(kept == (confidence == 0.0f));
+    return kept;
+}
+
+// What lies behind the frame's surface is hidden, unless a reference looks through that surface, as those do that have it in
+// their image, or it is nearly transparent, or its splats were made from few photos.
+static void test_warp_hidden(void) {
+    CHECK(warp_keeps(6, 0.4, 0.5f, 1) && warp_keeps(8, -0.4, 0.5f, 1));
+    CHECK(!warp_keeps(6, 0.0, 0.5f, 1) && !warp_keeps(6, 0.1, 0.5f, 1)); // looked through
+    CHECK(!warp_keeps(5, 0.4, 0.5f, 1) && !warp_keeps(2, 0.4, 0.5f, 1)); // few photos
+    CHECK(!warp_keeps(6, 0.4, 0.5f, 0) && !warp_keeps(6, 0.4, 0.0f, 1)); // transparent, or nothing there
+    CHECK(!warp_keeps(6, 0.4, 2.0f, 1) && !warp_keeps(6, 0.4, 0.95f, 1)); // in front of the frame's, or hardly behind it
 }
 
 static void test_warp_groups(void) {
@@ -229,6 +270,7 @@ int main(void) {
     test_visits(&ctx);
     test_origin();
     test_warp_groups();
+    test_warp_hidden();
     test_dense_angles();
     return test_report();
 }
