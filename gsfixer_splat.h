@@ -607,12 +607,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_t
 
 // Training-free restorer: shows in a frame what the reference photos show of it. Where other photos confirm depth and
 // colour, the photos' colours replace the render; if there are six photos or more, only one that shows another depth, and
-// the residual (photo - render at the photo's camera) is added in full to one that agrees. Where only the splats vouch for
-// the depth, the residual is added with less weight and less confidence; where no reference sees a pixel, the render is kept
-// with confidence 0. Floaters, identified by two references that see through them, are
-// replaced by the photos behind them. Depths are those of stereo between the photos or, where it finds none, of the
-// splats. Without renders of the references, colours are taken everywhere. Destroy with
-// gsf_destroy_restorer.
+// the residual (photo - render at the photo's camera) is added in full to one that agrees; what lies behind the frame's own
+// surface is then shown only where a photo looks through that surface. Where only the splats vouch for the depth, the
+// residual is added with less weight and less confidence; where no reference sees a pixel, the render is kept with
+// confidence 0. Floaters, identified by two references that see through them, are replaced by the photos behind them. Depths
+// are those of stereo between the photos or, where it finds none, of the splats. Without renders of the references, colours
+// are taken everywhere. Destroy with gsf_destroy_restorer.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 
 // ---- the repair loop -----------------------------------------------------------
@@ -5225,7 +5225,7 @@ typedef struct gsf__vis_counts {
     uint32_t tries[GSF__VIS_BINS], finds[GSF__VIS_BINS];
 } gsf__vis_counts;
 
-typedef struct gsf__rays8 gsf__rays8;
+typedef struct gsf__rays gsf__rays;
 typedef struct gsf__hider gsf__hider;
 
 typedef struct gsf__vis_job {
@@ -5237,7 +5237,8 @@ typedef struct gsf__vis_job {
     uint8_t* seen;             // (count) points set on entry are not traced
     gsf__vis_counts* counts;   // per chunk of discs, so that summing needs no atomics
     void* embree_scene;
-    int (*hide8)(gsf__rays8* rays, const gsf__hider* hider); // scalar or AVX2: see >>embree
+    int (*hide)(gsf__rays* rays, gsf__hider* hiders, int count, int open, int* next); // see >>embree
+    uint32_t* hiders;          // (count) a disc that hid the point from the last eye that traced it; UINT32_MAX: none did
     // evidence from the tracks
     const gsf_scene* scene;
     double* centers;           // (view_count,3) centres of all views, relative to the discs' origin
@@ -5757,26 +5758,29 @@ GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* sc
 #ifdef GSF_USE_EMBREE
 
 /* In a dense cloud most points are hidden from most views, and neighbouring points are hidden by the same discs. So
-   groups of eight neighbouring points are first tested, in float with bounds on all rounding errors, against the discs
-   that hid the previous group, then against the neighbours of those discs that cover a point. Only points that these
-   tests do not prove hidden are traced with Embree. */
-struct gsf__rays8 {
-    float direction[3][8], distance[8];
-    float own[8];              // tolerance times the radius of the point's own disc
-    float cover[8], need[8];   // lower bound of the cover so far; cover at which the point is hidden
+   groups of sixteen neighbouring points are first tested, in float with bounds on all rounding errors, against the discs
+   that hid the previous group, then against the neighbours of those discs that cover a point, and then against the discs
+   that hid them from an earlier eye, with their neighbours. Only points that these tests do not prove hidden are traced
+   with Embree. */
+enum { GSF__VIS_GROUP = 16, GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
+
+struct gsf__rays {
+    float direction[3][GSF__VIS_GROUP], distance[GSF__VIS_GROUP];
+    float own[GSF__VIS_GROUP];   // tolerance times the radius of the point's own disc
+    float cover[GSF__VIS_GROUP]; // lower bound of the cover so far
+    float need[GSF__VIS_GROUP];  // cover at which the point is hidden
 };
 
 struct gsf__hider { // a disc that may hide points, relative to the eye
     // plane: distance of the disc's plane from the eye; inverse2: 1 / radius^2; reach: tolerance times radius
     float center[3], normal[3], plane, inverse2, reach;
     uint32_t disc;
-    int32_t covered; // the bits that hide8 returned for the current group
+    int32_t covered; // bits: rays of the current group that it covers
 };
-
-enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_HIDE
+#define GSF__KERNELS_AVX512
 #define GSF__KERNELS_SIMD128
 #include "gsfixer.h"
 #undef GSF__KERNELS_HIDE
@@ -5785,32 +5789,38 @@ enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_HIDE
 
-// Adds a lower bound of the disc's cover to each ray. Returns bits 0-7: the disc covers the ray; 8-15: the ray is not
-// yet proved hidden.
-GSF__V_KERNEL int GSF__V(gsf__hide8)(gsf__rays8* rays, const gsf__hider* hider) {
-    const float *c = hider->center, *n = hider->normal;
+// Adds lower bounds of the discs' cover to the rays, disc by disc from *next on, until none of the rays `open` (bits) remains
+// that is not proved hidden. Returns those that remain; *next: the first disc that was not tested.
+GSF__V_KERNEL int GSF__V(gsf__hide)(gsf__rays* rays, gsf__hider* hiders, int count, int open, int* next) {
     const gsf__vf one = gsf__v_set(1.0f), zero = gsf__v_set(0.0f);
-    uint32_t bits = 0;
-    for (int l = 0; l < 8; l += GSF__LANES) {
-        const gsf__vf distance = gsf__v_load(rays->distance + l), x = gsf__v_load(rays->direction[0] + l);
-        const gsf__vf y = gsf__v_load(rays->direction[1] + l), z = gsf__v_load(rays->direction[2] + l);
-        const gsf__vf slope = gsf__v_madd(x, gsf__v_set(n[0]), gsf__v_madd(y, gsf__v_set(n[1]), z * gsf__v_set(n[2])));
-        const gsf__vf inverse = one / slope, t = gsf__v_set(hider->plane) * inverse;
-        const gsf__vf error = gsf__v_set(1e-6f) * distance * gsf__v_abs(inverse);
-        const gsf__vf gap = distance - t - gsf__v_max(gsf__v_load(rays->own + l), gsf__v_set(hider->reach));
-        const gsf__vf qx = gsf__v_msub(t, x, gsf__v_set(c[0])), qy = gsf__v_msub(t, y, gsf__v_set(c[1]));
-        const gsf__vf qz = gsf__v_msub(t, z, gsf__v_set(c[2]));
-        const gsf__vf length2 = gsf__v_madd(qx, qx, gsf__v_madd(qy, qy, qz * qz));
-        const gsf__vf q2 = gsf__v_madd(gsf__v_set(1.01f), length2, // >= (q + error)^2
-                                       gsf__v_set(101.0f) * (error * error));
-        const gsf__vf cover = gsf__v_nmadd(q2, gsf__v_set(hider->inverse2), one);
-        const gsf__vm hit = gsf__vm_and(gsf__v_gt(t, error),
-                                        gsf__vm_and(gsf__v_gt(gap, error + error), gsf__v_gt(cover, zero)));
-        const gsf__vf sum = gsf__v_load(rays->cover + l) + gsf__v_keep(hit, cover);
-        gsf__v_store(rays->cover + l, sum);
-        bits |= gsf__vm_bits(hit) << l | gsf__vm_bits(gsf__v_lt(sum, gsf__v_load(rays->need + l))) << (8 + l);
+    for (; open && *next < count; (*next)++) {
+        gsf__hider* hider = hiders + *next;
+        const float *c = hider->center, *n = hider->normal;
+        uint32_t covered = 0, left = 0;
+        for (int l = 0; l < GSF__VIS_GROUP; l += GSF__LANES) {
+            const gsf__vf distance = gsf__v_load(rays->distance + l), x = gsf__v_load(rays->direction[0] + l);
+            const gsf__vf y = gsf__v_load(rays->direction[1] + l), z = gsf__v_load(rays->direction[2] + l);
+            const gsf__vf slope = gsf__v_madd(x, gsf__v_set(n[0]), gsf__v_madd(y, gsf__v_set(n[1]), z * gsf__v_set(n[2])));
+            const gsf__vf inverse = one / slope, t = gsf__v_set(hider->plane) * inverse;
+            const gsf__vf error = gsf__v_set(1e-6f) * distance * gsf__v_abs(inverse);
+            const gsf__vf gap = distance - t - gsf__v_max(gsf__v_load(rays->own + l), gsf__v_set(hider->reach));
+            const gsf__vf qx = gsf__v_msub(t, x, gsf__v_set(c[0])), qy = gsf__v_msub(t, y, gsf__v_set(c[1]));
+            const gsf__vf qz = gsf__v_msub(t, z, gsf__v_set(c[2]));
+            const gsf__vf length2 = gsf__v_madd(qx, qx, gsf__v_madd(qy, qy, qz * qz));
+            const gsf__vf q2 = gsf__v_madd(gsf__v_set(1.01f), length2, // >= (q + error)^2
+                                           gsf__v_set(101.0f) * (error * error));
+            const gsf__vf cover = gsf__v_nmadd(q2, gsf__v_set(hider->inverse2), one);
+            const gsf__vm hit = gsf__vm_and(gsf__v_gt(t, error),
+                                            gsf__vm_and(gsf__v_gt(gap, error + error), gsf__v_gt(cover, zero)));
+            const gsf__vf sum = gsf__v_load(rays->cover + l) + gsf__v_keep(hit, cover);
+            gsf__v_store(rays->cover + l, sum);
+            covered |= gsf__vm_bits(hit) << l;
+            left |= gsf__vm_bits(gsf__v_lt(sum, gsf__v_load(rays->need + l))) << l;
+        }
+        hider->covered = (int32_t)covered;
+        open &= (int)left;
     }
-    return (int)bits;
+    return open;
 }
 
 #endif // GSF__KERNELS_HIDE
@@ -5829,10 +5839,12 @@ typedef struct gsf__embree_query { // starts with Embree's context, whose addres
     gsf__sight sight;
     size_t point;
     double cover, limit;              // cover of the discs hit so far; cover at which the point is hidden
-    // the current group of up to eight points
-    size_t points[8];
+    double most;                      // cover of the disc that covers it most
+    uint32_t hider;                   // that disc
+    // the current group of points
+    size_t points[GSF__VIS_GROUP];
     int ray_count;
-    gsf__rays8 rays;
+    gsf__rays rays;
     gsf__hider queue[GSF__VIS_QUEUE]; // starts with discs that covered points of the previous group
     int queue_count;
     uint64_t queued[16];              // bit set of the discs in the queue, by disc modulo 1024
@@ -5869,14 +5881,19 @@ static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
                                         (double)q->job->desc->tolerance);
     q->cover += cover;
     if (q->cover < q->limit) args->valid[0] = 0;
-    if (cover > 0.0) gsf__embree_enqueue(q, hit->primID);
+    if (!(cover > 0.0)) return;
+    gsf__embree_enqueue(q, hit->primID);
+    if (cover > q->most) {
+        q->most = cover;
+        q->hider = hit->primID;
+    }
 }
 
 static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     const gsf__vis_job* job = q->job;
     if (!gsf__vis_sight(job, q->eye, i, &q->sight)) return;
     q->point = i;
-    q->cover = 0.0;
+    q->cover = q->most = 0.0;
     q->limit = (double)gsf__vis_limit(job, i);
     // The ray starts at the eye and ends `tolerance` short of the point. (Starting at the point would depend on Embree's
     // version: some report a disc that contains the origin, others do not.)
@@ -5902,35 +5919,34 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
 #endif
     }
     job->seen[i] = q->cover < q->limit;
+    if (q->most > 0.0) job->hiders[i] = q->hider;
 }
 
 // Tests the rays against the queued discs from *next on, and enqueues the neighbours of discs that cover an open ray.
 // `open`: bits of the rays not yet proved hidden; returns those that remain.
 static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int open) {
     const gsf__discs* discs = &q->job->discs;
-    while (open) {
-        if (*next < q->queue_count) {
-            gsf__hider* hider = q->queue + (*next)++;
-            hider->covered = q->job->hide8(&q->rays, hider);
-            open &= hider->covered >> 8;
-        } else if (*expanded < *next) {
-            const gsf__hider* hider = q->queue + (*expanded)++;
-            if (!(hider->covered & open)) continue;
-            const uint32_t* nearest = discs->nearest + (size_t)discs->near_count * hider->disc;
-            for (int n = 0; n < discs->near_count; n++) gsf__embree_enqueue(q, nearest[n]);
-        } else {
-            break;
-        }
+    for (;;) {
+        open = q->job->hide(&q->rays, q->queue, q->queue_count, open, next);
+        if (!open) return 0;
+        while (*expanded < *next && !(q->queue[*expanded].covered & open)) (*expanded)++;
+        if (*expanded == *next) return open;
+        const uint32_t* nearest = discs->nearest + (size_t)discs->near_count * q->queue[(*expanded)++].disc;
+        for (int n = 0; n < discs->near_count; n++) gsf__embree_enqueue(q, nearest[n]);
     }
-    return open;
 }
 
 static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
-    for (int l = q->ray_count; l < 8; l++) { // unused lanes
+    for (int l = q->ray_count; l < GSF__VIS_GROUP; l++) { // unused lanes
         q->rays.direction[0][l] = q->rays.direction[1][l] = q->rays.direction[2][l] = 0.0f;
         q->rays.distance[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
     }
     int next = 0, expanded = 0, open = gsf__embree_meet(q, &next, &expanded, (1 << q->ray_count) - 1);
+    for (int l = 0; l < q->ray_count; l++) {
+        const uint32_t hider = q->job->hiders[q->points[l]];
+        if ((open >> l & 1) && hider != UINT32_MAX) gsf__embree_enqueue(q, hider);
+    }
+    open = gsf__embree_meet(q, &next, &expanded, open);
     for (int l = 0; l < q->ray_count; l++) {
         counts->rays += open >> l & 1;
         counts->culled += !(open >> l & 1);
@@ -5941,7 +5957,7 @@ static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
     memset(q->queued, 0, sizeof q->queued);
     q->queue_count = q->ray_count = 0;
     for (int k = 0; k < next && q->queue_count < GSF__VIS_HIDERS; k++) {
-        if (!(q->queue[k].covered & 255)) continue;
+        if (!q->queue[k].covered) continue;
         const uint32_t disc = q->queue[k].disc;
         q->queued[disc >> 6 & 15u] |= (uint64_t)1 << (disc & 63u);
         q->queue[q->queue_count++] = q->queue[k];
@@ -5955,7 +5971,7 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t first = chunk * GSF__VIS_CHUNK;
     const int side = gsf__vis_side(job->eye, job->regions + 6 * chunk);
     gsf__embree_query query;
-    gsf__rays8* rays = &query.rays;
+    gsf__rays* rays = &query.rays;
     query.job = job;
     query.eye = job->eye;
     query.queue_count = query.ray_count = 0;
@@ -5987,7 +6003,7 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
         rays->own[l] = job->desc->tolerance * sphere[3];
         rays->cover[l] = 0.0f;
         rays->need[l] = limit * 1.00001f;
-        if (++query.ray_count == 8) gsf__embree_group(&query, counts);
+        if (++query.ray_count == GSF__VIS_GROUP) gsf__embree_group(&query, counts);
     }
     if (query.ray_count) gsf__embree_group(&query, counts);
 }
@@ -6030,7 +6046,10 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
-    job->hide8 = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__hide8);
+    job->hide = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__hide);
+    job->hiders = (uint32_t*)gsf__arena_alloc(&job->arena, job->discs.count, sizeof(uint32_t));
+    if (!job->hiders) return GSF_ERROR_OUT_OF_MEMORY;
+    memset(job->hiders, 0xff, job->discs.count * sizeof(uint32_t));
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_embree_chunk);

@@ -124,11 +124,16 @@ static void cut_hole(const mini_batch* b, size_t sample, mini_sample s) {
 }
 
 // Splats with a part of their faults only: less of them in the render, and in the residuals at the photos.
-static void better_pixel(float part, mini_sample s, int64_t at, int64_t pixels) {
+static void better_pixel(float render_part, float residual_part, mini_sample s, int64_t at, int64_t pixels) {
     float* render = s.frame + at * GSF__MINI_FRAME;
-    for (int c = 0; c < 3; c++) render[c] = s.truth[3 * at + c] + part * (render[c] - s.truth[3 * at + c]);
+    for (int c = 0; c < 3; c++) render[c] = s.truth[3 * at + c] + render_part * (render[c] - s.truth[3 * at + c]);
     for (int r = 0; r < DATA_REFERENCES; r++)
-        for (int c = 3; c < 6; c++) s.shown[(r * pixels + at) * GSF__MINI_REFERENCE + c] *= part;
+        for (int c = 3; c < 6; c++) s.shown[(r * pixels + at) * GSF__MINI_REFERENCE + c] *= residual_part;
+}
+
+// Part of its faults that a render, or the residuals, keep: down to -30 dB.
+static float draw_part(const mini_batch* b, size_t sample, int which) {
+    return draw_of(b, sample, which) < b->better ? (float)exp(-3.5 * draw_of(b, sample, which + 1)) : 1.0f;
 }
 
 static void make_sample(void* arg, size_t index, int32_t worker) {
@@ -142,7 +147,8 @@ static void make_sample(void* arg, size_t index, int32_t worker) {
     const int64_t x0 = (int64_t)((double)(width - crop + 1) * draw_of(b, sample, 3));
     const int mirror = draw_of(b, sample, 4) < 0.5, flip = draw_of(b, sample, 5) < 0.5, swap = draw_of(b, sample, 6) < 0.5;
     const tone_curve curve = draw_tone(b, sample);
-    const float fault = draw_of(b, sample, 7) < b->better ? (float)exp(-3.5 * draw_of(b, sample, 8)) : 1.0f; // down to -30 dB
+    // Apart from each other, since splats of few photos fit these and are wrong elsewhere: only photos tell what is right.
+    const float render_part = draw_part(b, sample, 7), residual_part = draw_part(b, sample, 15);
     (void)worker;
     for (int64_t y = 0; y < crop; y++)
         for (int64_t x = 0; x < crop; x++) {
@@ -150,7 +156,7 @@ static void make_sample(void* arg, size_t index, int32_t worker) {
             const int64_t row = frame * height + y0 + (flip ? crop - 1 - v : v), column = x0 + (mirror ? crop - 1 - u : u);
             read_pixel((const uint8_t*)t->data + (row * width + column) * DATA_PIXEL, s, at, pixels);
             tone_pixel(&curve, s, at, pixels);
-            better_pixel(fault, s, at, pixels);
+            better_pixel(render_part, residual_part, s, at, pixels);
         }
     vary_references(b, sample, s);
     if (draw_of(b, sample, 40) < 0.25) cut_hole(b, sample, s);

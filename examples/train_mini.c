@@ -357,7 +357,7 @@ static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_te
         result = measure_frame(&c, &squares);
         add_frame(all, squares, share);
         const float part = (float)fmin(1.0, sqrt(pow(10.0, -0.1 * GOOD_DECIBELS) / fmax(squares.before, 1e-10)));
-        for (int64_t i = 0; i < pixels; i++) better_pixel(part, c.sample, i, pixels);
+        for (int64_t i = 0; i < pixels; i++) better_pixel(part, part, c.sample, i, pixels);
         if (result == GSF_OK) result = measure_frame(&c, &squares);
         add_frame(good, squares, share);
     }
