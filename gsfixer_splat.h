@@ -7510,10 +7510,12 @@ struct gsf_rasterizer {
     size_t tile_capacity;      // of tile_begin
     size_t* tile_begin;        // (tiles + 1) start of each tile's list
     size_t count_capacity;
-    size_t* tile_counts;       // (chunks, tiles) while binning
+    uint32_t* tile_counts;     // (chunks, tiles) while binning
+    size_t span_capacity;
+    gsf__tile_span* spans;     // of each splat's tile rows, while binning
     size_t pair_capacity;
     uint32_t* pair_splat;      // the splats of each tile, in index order
-    size_t* splat_pairs;       // the indices of each splat in pair_splat, in tile order
+    uint32_t* splat_pairs;     // the indices of each splat in pair_splat, in tile order
     uint64_t* pair_keys;       // sort keys: depth bits << 32 | index in the tile's part of pair_splat
     uint64_t* pair_spare;      // scratch of the sort
     gsf__pair* pairs;          // the lists in depth order, for the raster loops
@@ -7550,7 +7552,7 @@ GSF_API gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** 
 
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
-    void* const owned[] = {r->records, r->radii, r->splat_begin, r->tile_begin, r->tile_counts, r->pair_splat,
+    void* const owned[] = {r->records, r->radii, r->splat_begin, r->tile_begin, r->tile_counts, r->spans, r->pair_splat,
                            r->splat_pairs, r->pair_keys, r->pair_spare, r->pairs, r->slots, r->slot_used, r->final_T,
                            r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
@@ -8123,11 +8125,13 @@ GSF__V_KERNEL void GSF__V(gsf__tile_columns)(const gsf_rasterizer* r, const gsf_
 #endif // GSF__KERNELS_SPLATS
 #ifndef GSF__ISA
 
+enum { GSF__BIN_CHUNKS = 32 };
+
 typedef struct gsf__bin_job {
     gsf_rasterizer* r;
     const gsf__view* view;
     size_t chunk_size;
-    int fill; // 0: count, 1: fill
+    size_t spans[GSF__BIN_CHUNKS + 1]; // of a chunk: how many; then its first one in r->spans
     gsf_cpu_level level;
 } gsf__bin_job;
 
@@ -8142,34 +8146,67 @@ static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int
     }
 }
 
-static void gsf__bin_chunk(void* arg, size_t chunk, int32_t worker) {
+static size_t gsf__bin_end(const gsf__bin_job* job, size_t chunk) {
+    const size_t end = (chunk + 1) * job->chunk_size;
+    return end < job->r->splat_count ? end : job->r->splat_count;
+}
+
+static void gsf__bin_measure_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    gsf__bin_job* job = (gsf__bin_job*)arg;
+    const size_t end = gsf__bin_end(job, chunk);
+    size_t count = GSF__SPANS; // that many are written together
+    for (size_t i = chunk * job->chunk_size; i < end; i++) {
+        const gsf__record* rec = job->r->records + i;
+        if (rec->radius <= 0) continue;
+        const gsf__tile_span rows = gsf__tile_rows(job->r, job->view, rec);
+        count += (size_t)(rows.x1 - rows.x0);
+    }
+    job->spans[chunk] = count;
+}
+
+static void gsf__bin_count_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__bin_job* job = (const gsf__bin_job*)arg;
     gsf_rasterizer* r = job->r;
-    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
-    size_t* counts = r->tile_counts + chunk * tiles;
-    const size_t begin = chunk * job->chunk_size;
-    const size_t end = begin + job->chunk_size < r->splat_count ? begin + job->chunk_size : r->splat_count;
-    for (size_t i = begin; i < end; i++) {
+    uint32_t* counts = r->tile_counts + chunk * (size_t)r->tiles_x * (size_t)r->tiles_y;
+    gsf__tile_span* span = r->spans + job->spans[chunk];
+    const size_t end = gsf__bin_end(job, chunk);
+    for (size_t i = chunk * job->chunk_size; i < end; i++) {
         const gsf__record* rec = r->records + i;
         size_t pairs = 0;
         if (rec->radius > 0) {
             const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
-            gsf__tile_span spans[GSF__SPANS];
-            for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
-                const int32_t at = (ty - rows.x0) % GSF__SPANS;
-                if (at == 0) gsf__tile_spans(job, rec, ty, rows.x1 - ty, spans);
-                for (int32_t tx = spans[at].x0; tx < spans[at].x1; tx++, pairs++) {
-                    size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
-                    if (job->fill) {
-                        r->pair_splat[*count] = (uint32_t)i;
-                        r->splat_pairs[r->splat_begin[i] + pairs] = *count;
-                    }
-                    ++*count;
-                }
+            for (int32_t ty = rows.x0; ty < rows.x1; ty += GSF__SPANS)
+                gsf__tile_spans(job, rec, ty, rows.x1 - ty, span + (ty - rows.x0));
+            for (int32_t ty = rows.x0; ty < rows.x1; ty++, span++) {
+                uint32_t* row = counts + (size_t)ty * (size_t)r->tiles_x;
+                for (int32_t tx = span->x0; tx < span->x1; tx++, pairs++) row[tx]++;
             }
         }
-        if (!job->fill) r->splat_begin[i + 1] = pairs;
+        r->splat_begin[i + 1] = pairs;
+    }
+}
+
+static void gsf__bin_fill_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    const gsf__bin_job* job = (const gsf__bin_job*)arg;
+    gsf_rasterizer* r = job->r;
+    uint32_t* next = r->tile_counts + chunk * (size_t)r->tiles_x * (size_t)r->tiles_y;
+    const gsf__tile_span* span = r->spans + job->spans[chunk];
+    const size_t end = gsf__bin_end(job, chunk);
+    for (size_t i = chunk * job->chunk_size; i < end; i++) {
+        if (r->records[i].radius <= 0) continue;
+        const gsf__tile_span rows = gsf__tile_rows(r, job->view, r->records + i);
+        uint32_t* pair = r->splat_pairs + r->splat_begin[i];
+        for (int32_t ty = rows.x0; ty < rows.x1; ty++, span++) {
+            uint32_t* row = next + (size_t)ty * (size_t)r->tiles_x;
+            for (int32_t tx = span->x0; tx < span->x1; tx++) {
+                const uint32_t at = row[tx]++;
+                r->pair_splat[at] = (uint32_t)i;
+                *pair++ = at;
+            }
+        }
     }
 }
 
@@ -8204,24 +8241,32 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     job.r = r;
     job.view = view;
     job.level = ctx->cpu_level;
-    job.fill = 0;
-    job.chunk_size = r->splat_count / 32 + 1;
+    job.chunk_size = r->splat_count / GSF__BIN_CHUNKS + 1;
     if (job.chunk_size < 1024) job.chunk_size = 1024;
     const size_t chunks = (r->splat_count + job.chunk_size - 1) / job.chunk_size;
     GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_begin, &r->tile_capacity, 0, tiles + 1, sizeof(size_t)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_counts, &r->count_capacity, 0, chunks * tiles, sizeof(size_t)));
-    if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(size_t));
-    gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_counts, &r->count_capacity, 0, chunks * tiles, sizeof(uint32_t)));
+    if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(uint32_t));
+    gsf__parallel_for(ctx, chunks, gsf__bin_measure_chunk, &job);
+    size_t spans = 0, total = 0;
+    for (size_t c = 0; c < chunks; c++) {
+        const size_t n = job.spans[c];
+        job.spans[c] = spans;
+        spans += n;
+    }
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->spans, &r->span_capacity, 0, spans, sizeof(gsf__tile_span)));
+    gsf__parallel_for(ctx, chunks, gsf__bin_count_chunk, &job);
 
-    size_t total = 0; // prefix sums: each count becomes the index at which its chunk writes
-    for (size_t t = 0; t < tiles; t++) {
+    for (size_t t = 0; t < tiles; t++) { // prefix sums: each count becomes the index at which its chunk writes
         r->tile_begin[t] = total;
         for (size_t c = 0; c < chunks; c++) {
-            const size_t n = r->tile_counts[c * tiles + t];
-            r->tile_counts[c * tiles + t] = total;
+            const uint32_t n = r->tile_counts[c * tiles + t];
+            r->tile_counts[c * tiles + t] = (uint32_t)total;
             total += n;
         }
     }
+    if (total > UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "rasterizer: %zu pairs of splats and tiles do not fit 32 bits", total);
     r->tile_begin[tiles] = total;
     r->splat_begin[0] = 0;
     for (size_t i = 0; i < r->splat_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
@@ -8233,11 +8278,10 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
         GSF__TRY(gsf__grow(ctx, (void**)&r->pair_keys, capacity, sizeof(uint64_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->pair_spare, capacity, sizeof(uint64_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->pairs, capacity, sizeof(gsf__pair)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_pairs, capacity, sizeof(size_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_pairs, capacity, sizeof(uint32_t)));
         r->pair_capacity = capacity;
     }
-    job.fill = 1;
-    gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
+    gsf__parallel_for(ctx, chunks, gsf__bin_fill_chunk, &job);
     return GSF_OK;
 }
 
