@@ -4824,7 +4824,7 @@ typedef struct gsf__knn_tree {
     gsf__arena arena;
 } gsf__knn_tree;
 
-enum { GSF__KNN_LEAF = 8, GSF__KNN_MAX = 64, GSF__KNN_CHUNK = 1024 };
+enum { GSF__KNN_LEAF = 8, GSF__KNN_MAX = 64, GSF__KNN_CHUNK = 1024, GSF__KNN_SPLIT = 8 };
 
 static size_t gsf__knn_begin(const gsf__knn_tree* tree, uint32_t level, size_t node) {
     return (size_t)(((uint64_t)tree->count * node) >> level); // count and node are below 2^32
@@ -4861,33 +4861,36 @@ static void gsf__knn_select(gsf__knn_tree* tree, size_t begin, size_t nth, size_
     }
 }
 
+// Makes the box of a node, and divides its points unless it is a leaf.
+static void gsf__knn_build_node(gsf__knn_tree* tree, uint32_t level, size_t node) {
+    const size_t begin = gsf__knn_begin(tree, level, node), end = gsf__knn_begin(tree, level, node + 1);
+    double* box = tree->boxes + 6 * (((size_t)1 << level) - 1 + node);
+    for (int k = 0; k < 3; k++) box[k] = box[3 + k] = tree->points[3 * begin + (size_t)k];
+    for (size_t i = begin + 1; i < end; i++)
+        for (int k = 0; k < 3; k++) {
+            const double x = tree->points[3 * i + (size_t)k];
+            if (x < box[k]) box[k] = x;
+            if (x > box[3 + k]) box[3 + k] = x;
+        }
+    if (level == tree->levels) return;
+    int axis = 0;
+    for (int k = 1; k < 3; k++)
+        if (box[3 + k] - box[k] > box[3 + axis] - box[axis]) axis = k;
+    gsf__knn_select(tree, begin, gsf__knn_begin(tree, level + 1, 2 * node + 1), end, axis);
+}
+
 typedef struct gsf__knn_build_job {
     gsf__knn_tree* tree;
-    uint32_t level;
-    size_t nodes_per_chunk;
+    uint32_t level, last;
 } gsf__knn_build_job;
 
-static void gsf__knn_build_chunk(void* arg, size_t chunk, int32_t worker) {
+// A node of the level, and those below it down to the level `last`: a subtree of a large tree fits the cache.
+static void gsf__knn_build_chunk(void* arg, size_t node, int32_t worker) {
     (void)worker;
     const gsf__knn_build_job* job = (const gsf__knn_build_job*)arg;
-    gsf__knn_tree* tree = job->tree;
-    const size_t node_count = (size_t)1 << job->level;
-    const size_t first = chunk * job->nodes_per_chunk;
-    for (size_t node = first; node < node_count && node < first + job->nodes_per_chunk; node++) {
-        const size_t begin = gsf__knn_begin(tree, job->level, node), end = gsf__knn_begin(tree, job->level, node + 1);
-        double* box = tree->boxes + 6 * (node_count - 1 + node);
-        for (int k = 0; k < 3; k++) box[k] = box[3 + k] = tree->points[3 * begin + (size_t)k];
-        for (size_t i = begin + 1; i < end; i++)
-            for (int k = 0; k < 3; k++) {
-                const double x = tree->points[3 * i + (size_t)k];
-                if (x < box[k]) box[k] = x;
-                if (x > box[3 + k]) box[3 + k] = x;
-            }
-        if (job->level == tree->levels) continue;
-        int axis = 0;
-        for (int k = 1; k < 3; k++)
-            if (box[3 + k] - box[k] > box[3 + axis] - box[axis]) axis = k;
-        gsf__knn_select(tree, begin, gsf__knn_begin(tree, job->level + 1, 2 * node + 1), end, axis);
+    for (uint32_t level = job->level; level <= job->last; level++) {
+        const uint32_t below = level - job->level;
+        for (size_t i = node << below; i < (node + 1) << below; i++) gsf__knn_build_node(job->tree, level, i);
     }
 }
 
@@ -4919,27 +4922,31 @@ static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t 
     if (n == 0) return GSF_OK;
     gsf__knn_build_job job;
     job.tree = tree;
-    for (job.level = 0; job.level <= tree->levels; job.level++) {
-        const size_t nodes = (size_t)1 << job.level;
-        job.nodes_per_chunk = (nodes + 255) / 256;
-        gsf__parallel_for(ctx, (nodes + job.nodes_per_chunk - 1) / job.nodes_per_chunk, gsf__knn_build_chunk, &job);
+    for (job.level = 0; job.level <= tree->levels; job.level = job.last + 1) {
+        job.last = job.level < GSF__KNN_SPLIT ? job.level : tree->levels;
+        gsf__parallel_for(ctx, (size_t)1 << job.level, gsf__knn_build_chunk, &job);
     }
     return GSF_OK;
+}
+
+static double gsf__distance2(const double a[3], const double b[3]) {
+    const double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2];
+    return x * x + y * y + z * z;
 }
 
 static double gsf__knn_box_distance2(const double box[6], const double q[3]) {
     double sum = 0.0;
     for (int k = 0; k < 3; k++) {
-        const double d = q[k] < box[k] ? box[k] - q[k] : q[k] > box[3 + k] ? q[k] - box[3 + k] : 0.0;
-        sum += d * d;
+        const double below = box[k] - q[k], above = q[k] - box[3 + k], d = below > above ? below : above;
+        sum += d > 0.0 ? d * d : 0.0;
     }
     return sum;
 }
 
 // Finds the k points nearest to q (k <= GSF__KNN_MAX), nearest first: squared distances and positions in tree order.
-// The point at position `skip` is excluded (SIZE_MAX: none). Returns the number found, which is less than k only if the
-// tree has too few points. Ties depend only on the tree.
-static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, int k, double* distance2,
+// The point at position `skip` is excluded (SIZE_MAX: none), and points are left out whose squared distance is `beyond` or
+// more. Returns the number found, which is less than k only if there are too few. Ties depend only on the tree.
+static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, double beyond, int k, double* distance2,
                           size_t* places) {
     struct { size_t node; double distance2; uint32_t level; } stack[40];
     int depth = 0, found = 0;
@@ -4951,7 +4958,7 @@ static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t s
         depth--;
         size_t node = stack[depth].node;
         uint32_t level = stack[depth].level;
-        if (found == k && stack[depth].distance2 >= distance2[k - 1]) continue;
+        if (stack[depth].distance2 >= beyond) continue;
         while (level < tree->levels) { // descend to the nearer child, push the farther
             level++;
             const double* boxes = tree->boxes + 6 * (((size_t)1 << level) - 1 + 2 * node);
@@ -4964,10 +4971,8 @@ static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t s
         }
         const size_t end = gsf__knn_begin(tree, level, node + 1);
         for (size_t i = gsf__knn_begin(tree, level, node); i < end; i++) {
-            const double* p = tree->points + 3 * i;
-            const double x = p[0] - q[0], y = p[1] - q[1], z = p[2] - q[2];
-            const double d = x * x + y * y + z * z;
-            if (i == skip || (found == k && d >= distance2[k - 1])) continue;
+            const double d = gsf__distance2(tree->points + 3 * i, q);
+            if (i == skip || d >= beyond) continue;
             int at = found < k ? found++ : k - 1;
             for (; at > 0 && distance2[at - 1] > d; at--) {
                 distance2[at] = distance2[at - 1];
@@ -4975,6 +4980,7 @@ static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t s
             }
             distance2[at] = d;
             places[at] = i;
+            if (found == k) beyond = distance2[k - 1];
         }
     }
     return found;
@@ -4992,7 +4998,7 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
     for (size_t i = first; i < job->tree->count && i < first + GSF__KNN_CHUNK; i++) {
         double distance2[3];
         size_t places[3];
-        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, 3, distance2, places);
+        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, INFINITY, 3, distance2, places);
         double mean = 0.0;
         for (int k = 0; k < found; k++) mean += distance2[k];
         if (found) mean /= found;
@@ -5051,11 +5057,23 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
 
 // ---- >>visibility --------------------------------------------------------------
 
+// Before an array or a variable that kernels read in whole cache lines: a vector across two is slow to load, and slower
+// to load soon after it was stored.
+#if defined(__GNUC__) || defined(__clang__)
+#define GSF__LINES __attribute__((aligned(64)))
+#else
+#define GSF__LINES
+#endif
+
+typedef struct gsf__disc { // Embree reads it where it lies, centre with radius and normal by 16 bytes each
+    float center[3], radius;
+    float normal[3], inverse2; // of unit length; 1 / radius^2
+} gsf__disc;
+
 typedef struct gsf__discs { // the points as oriented discs, in tree order (neighbours are close in memory)
     size_t count;
     double origin[3];  // origin of the float coordinates
-    float* spheres;    // (count + 1,4) centre, radius; padded by a row because Embree loads 16 bytes at a time
-    float* normals;    // (count + 2,3) unit normals, padded likewise
+    gsf__disc* all;    // (count)
     uint32_t* rows;    // (count) index of the scene's point
     uint32_t* nearest; // (count,near_count) indices of the neighbours in tree order
     int near_count;
@@ -5118,11 +5136,18 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     const int wanted = job->desc->neighbours > job->desc->radius_neighbour ? job->desc->neighbours
                                                                           : job->desc->radius_neighbour;
     const size_t first = chunk * GSF__KNN_CHUNK;
+    double distance2[GSF__KNN_MAX];
+    size_t places[GSF__KNN_MAX];
+    int found = 0;
     for (size_t i = first; i < tree->count && i < first + GSF__KNN_CHUNK; i++) {
         const double* p = tree->points + 3 * i;
-        double distance2[GSF__KNN_MAX];
-        size_t places[GSF__KNN_MAX];
-        const int found = gsf__knn_query(tree, p, i, wanted, distance2, places);
+        // The point before and its neighbours are as many others as are wanted, so that the farthest of them is a limit.
+        double beyond = found == wanted ? gsf__distance2(p, p - 3) : INFINITY;
+        for (int k = 0; k < found; k++) {
+            const double d = gsf__distance2(p, tree->points + 3 * places[k]);
+            if (d > beyond) beyond = d;
+        }
+        found = gsf__knn_query(tree, p, i, nextafter(beyond, INFINITY), wanted, distance2, places);
         const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
         double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
         memset(cov, 0, sizeof cov);
@@ -5140,21 +5165,38 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
         uint32_t* nearest = job->discs->nearest + (size_t)job->discs->near_count * i;
         for (int k = 0; k < used; k++) nearest[k] = (uint32_t)places[k];
         const int at = found < job->desc->radius_neighbour ? found : job->desc->radius_neighbour;
-        float* sphere = job->discs->spheres + 4 * i;
+        gsf__disc* disc = job->discs->all + i;
         for (int a = 0; a < 3; a++) {
-            sphere[a] = (float)(p[a] - job->discs->origin[a]);
-            job->discs->normals[3 * i + (size_t)a] = (float)normal[a];
+            disc->center[a] = (float)(p[a] - job->discs->origin[a]);
+            disc->normal[a] = (float)normal[a];
         }
-        sphere[3] = (float)(at ? (double)job->desc->radius_scale * sqrt(distance2[at - 1]) : 0.0);
+        disc->radius = (float)(at ? (double)job->desc->radius_scale * sqrt(distance2[at - 1]) : 0.0);
         job->discs->rows[i] = tree->rows[i];
     }
 }
 
-static int gsf__compare_floats(const void* a, const void* b) {
-    float x, y;
-    memcpy(&x, a, sizeof x);
-    memcpy(&y, b, sizeof y);
-    return (x > y) - (x < y);
+// The value at position nth of the sorted values, which are rearranged.
+static float gsf__nth_value(float* values, size_t count, size_t nth) {
+    size_t begin = 0, end = count;
+    for (;;) {
+        const float pivot = values[begin + (size_t)(gsf_draw_bits(begin, end, nth) % (end - begin))];
+        size_t below = begin, above = end;
+        for (size_t i = begin; i < above;) {
+            const float x = values[i];
+            if (x < pivot) {
+                values[i++] = values[below];
+                values[below++] = x;
+            } else if (x > pivot) {
+                values[i] = values[--above];
+                values[above] = x;
+            } else {
+                i++;
+            }
+        }
+        if (nth < below) end = below;
+        else if (nth >= above) begin = above;
+        else return pivot;
+    }
 }
 
 // Makes the discs. Normals come from a PCA of the neighbours. The radius is the distance to a neighbour, at most 3
@@ -5171,8 +5213,7 @@ static gsf_result gsf__discs_make(gsf__arena* arena, const gsf_scene* scene, con
     if (result != GSF_OK) goto cleanup;
     memcpy(discs->origin, origin, sizeof discs->origin);
     discs->near_count = count <= (size_t)desc->neighbours ? (int)count - (count > 0) : desc->neighbours;
-    discs->spheres = (float*)gsf__arena_alloc_zeroed(arena, count + 1, 4 * sizeof(float));
-    discs->normals = (float*)gsf__arena_alloc_zeroed(arena, count + 2, 3 * sizeof(float));
+    discs->all = (gsf__disc*)gsf__arena_alloc(arena, count, sizeof(gsf__disc));
     discs->rows = (uint32_t*)gsf__arena_alloc(arena, count, sizeof(uint32_t));
     discs->nearest = (uint32_t*)gsf__arena_alloc(arena, count, (size_t)(discs->near_count + 1) * sizeof(uint32_t));
     discs->oriented = (uint8_t*)gsf__arena_alloc_zeroed(arena, count, 1);
@@ -5187,14 +5228,14 @@ static gsf_result gsf__discs_make(gsf__arena* arena, const gsf_scene* scene, con
     {
         size_t n = 0;
         for (size_t i = 0; i < count; i++) // clusters of identical points have radius 0 and are ignored
-            if (discs->spheres[4 * i + 3] > 0.0f) radii[n++] = discs->spheres[4 * i + 3];
-        qsort(radii, n, sizeof(float), gsf__compare_floats);
-        const float most = n ? 3.0f * radii[n / 2] : 0.0f;
+            if (discs->all[i].radius > 0.0f) radii[n++] = discs->all[i].radius;
+        const float most = n ? 3.0f * gsf__nth_value(radii, n, n / 2) : 0.0f;
         for (size_t i = 0; i < count; i++) {
-            float* s = discs->spheres + 4 * i;
-            const float least = 1e-5f * (fabsf(s[0]) + fabsf(s[1]) + fabsf(s[2]));
-            if (s[3] > most) s[3] = most;
-            if (s[3] < least) s[3] = least;
+            gsf__disc* disc = discs->all + i;
+            const float least = 1e-5f * (fabsf(disc->center[0]) + fabsf(disc->center[1]) + fabsf(disc->center[2]));
+            if (disc->radius > most) disc->radius = most;
+            if (disc->radius < least) disc->radius = least;
+            disc->inverse2 = 1.0f / (disc->radius * disc->radius);
         }
     }
     result = gsf__check_cancel(ctx);
@@ -5225,8 +5266,16 @@ typedef struct gsf__vis_counts {
     uint32_t tries[GSF__VIS_BINS], finds[GSF__VIS_BINS];
 } gsf__vis_counts;
 
+typedef struct gsf__look { // of an eye at the discs
+    const gsf__eye* eye;
+    float* apart;    // (count) gsf__vis_apart
+    float* evidence; // (count) log likelihood ratio of being visible; NULL: no tracks
+} gsf__look;
+
 typedef struct gsf__rays gsf__rays;
-typedef struct gsf__hider gsf__hider;
+typedef struct gsf__hiders gsf__hiders;
+
+enum { GSF__VIS_CHUNK = 1024, GSF__VIS_LOOKS = 8, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 4096 };
 
 typedef struct gsf__vis_job {
     gsf__arena arena;          // all arrays
@@ -5237,18 +5286,18 @@ typedef struct gsf__vis_job {
     uint8_t* seen;             // (count) points set on entry are not traced
     gsf__vis_counts* counts;   // per chunk of discs, so that summing needs no atomics
     void* embree_scene;
-    int (*hide)(gsf__rays* rays, gsf__hider* hiders, int count, int open, int* next); // see >>embree
-    uint32_t* hiders;          // (count) a disc that hid the point from the last eye that traced it; UINT32_MAX: none did
+    int (*hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, int open); // see >>embree
     // evidence from the tracks
     const gsf_scene* scene;
     double* centers;           // (view_count,3) centres of all views, relative to the discs' origin
     float* regions;            // (chunks,6) bounding box of a chunk's disc centres: minimum, maximum
     float* facing;             // (count,3) sum of the unit directions to the point from the views of its track
-    float* apart;              // (count) gsf__vis_apart for the current eye
-    float* evidence;           // (count) log likelihood ratio of being visible from the current eye; NULL: no tracks
-    double found[GSF__VIS_BINS], missed[GSF__VIS_BINS]; // that ratio if the view is, or is not, in the track
-    const gsf__eye* eye;       // the current eye
-    // without Embree: the eye's image as a grid of cells, each with the points to test
+    float *apart, *evidence;   // (GSF__VIS_LOOKS,count) of the looks; NULL: no tracks
+    double found[GSF__VIS_BINS], missed[GSF__VIS_BINS]; // the evidence if the view is, or is not, in the track
+    gsf__look looks[GSF__VIS_LOOKS]; // of the eyes that are tested together
+    size_t look_count;
+    // without Embree: the image of one look as a grid of cells, each with the points to test
+    const gsf__look* look;
     int32_t* cells;            // (count) cell of the point, -1 = none
     gsf__disc_box* boxes;      // (count) cells that the disc touches
     gsf__disc_box* chunk_boxes; // (chunks) rows of cells that a chunk's discs touch
@@ -5260,17 +5309,15 @@ typedef struct gsf__vis_job {
     int32_t side;              // number of cells along each side of the image
 } gsf__vis_job;
 
-enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 4096 };
-
 static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int32_t worker)) {
     gsf__parallel_for(ctx, (job->discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, chunk, job);
 }
 
 static void gsf__vis_region(const gsf__discs* discs, size_t first, size_t end, float region[6]) {
-    for (int k = 0; k < 3; k++) region[k] = region[3 + k] = discs->spheres[4 * first + (size_t)k];
+    for (int k = 0; k < 3; k++) region[k] = region[3 + k] = discs->all[first].center[k];
     for (size_t i = first + 1; i < end; i++)
         for (int k = 0; k < 3; k++) {
-            const float x = discs->spheres[4 * i + (size_t)k];
+            const float x = discs->all[i].center[k];
             if (x < region[k]) region[k] = x;
             if (x > region[3 + k]) region[3 + k] = x;
         }
@@ -5305,11 +5352,10 @@ static int gsf__vis_side(const gsf__eye* eye, const float region[6]) {
 
 // Frustum and grazing-angle tests; returns 0 if the point needs no ray.
 static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i, gsf__sight* out) {
-    const float* sphere = job->discs.spheres + 4 * i;
-    const float* normal = job->discs.normals + 3 * i;
+    const gsf__disc* disc = job->discs.all + i;
     const double* m = eye->camera.w2c;
     double d[3], c[3];
-    for (int k = 0; k < 3; k++) d[k] = (double)sphere[k] - eye->center[k];
+    for (int k = 0; k < 3; k++) d[k] = (double)disc->center[k] - eye->center[k];
     for (int r = 0; r < 3; r++) c[r] = m[r] * d[0] + m[4 + r] * d[1] + m[8 + r] * d[2];
     if (!(c[2] > 0.0)) return 0;
     out->u = eye->camera.fx * c[0] / c[2] + eye->camera.cx;
@@ -5317,8 +5363,8 @@ static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i
     if (!(out->u >= 0.0 && out->v >= 0.0 && out->u < eye->camera.width && out->v < eye->camera.height)) return 0;
     out->distance = sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
     for (int k = 0; k < 3; k++) out->direction[k] = d[k] / out->distance;
-    const double cosine = out->direction[0] * (double)normal[0] + out->direction[1] * (double)normal[1] +
-                          out->direction[2] * (double)normal[2];
+    const double cosine = out->direction[0] * (double)disc->normal[0] + out->direction[1] * (double)disc->normal[1] +
+                          out->direction[2] * (double)disc->normal[2];
     return fabs(cosine) >= (double)job->desc->min_grazing_cos;
 }
 
@@ -5327,7 +5373,7 @@ static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i
 static float gsf__vis_apart(const gsf__vis_job* job, const gsf__eye* eye, size_t i, const gsf__sight* sight,
                             int* tracked) {
     const gsf_scene* scene = job->scene;
-    const float* sphere = job->discs.spheres + 4 * i;
+    const float* center = job->discs.all[i].center;
     const size_t row = job->discs.rows[i];
     double best = -2.0; // largest cosine, as cosine * |cosine| to avoid a square root per view
     *tracked = 0;
@@ -5336,7 +5382,7 @@ static float gsf__vis_apart(const gsf__vis_job* job, const gsf__eye* eye, size_t
         if (view == eye->view) { *tracked = 1; continue; }
         double along = 0.0, length2 = 0.0;
         for (int k = 0; k < 3; k++) {
-            const double d = (double)sphere[k] - job->centers[3 * (size_t)view + (size_t)k];
+            const double d = (double)center[k] - job->centers[3 * (size_t)view + (size_t)k];
             along += d * sight->direction[k];
             length2 += d * d;
         }
@@ -5371,7 +5417,7 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int32_t worker) {
             const double* center = job->centers + 3 * (size_t)scene->track_views[t];
             double d[3], length2 = 0.0;
             for (int k = 0; k < 3; k++) {
-                d[k] = (double)job->discs.spheres[4 * i + (size_t)k] - center[k];
+                d[k] = (double)job->discs.all[i].center[k] - center[k];
                 length2 += d[k] * d[k];
             }
             if (length2 > 0.0)
@@ -5400,7 +5446,7 @@ static void gsf__vis_orient_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__discs* discs = &job->discs;
     const size_t first = chunk * GSF__VIS_CHUNK, near_count = (size_t)discs->near_count;
     for (size_t i = first; i < discs->count && i < first + GSF__VIS_CHUNK; i++) {
-        float* normal = discs->normals + 3 * i;
+        float* normal = discs->all[i].normal;
         double along = 0.0;
         for (size_t n = 0; n < near_count; n++) {
             const float* facing = job->facing + 3 * (size_t)discs->nearest[near_count * i + n];
@@ -5434,39 +5480,42 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const size_t first = chunk * GSF__VIS_CHUNK;
-    const int outside = gsf__vis_side(job->eye, job->regions + 6 * chunk) < 0;
-    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
-        gsf__sight sight;
-        int tracked;
-        job->apart[i] = -1.0f;
-        job->evidence[i] = 0.0f;
-        if (outside || !gsf__vis_sight(job, job->eye, i, &sight)) continue;
-        job->apart[i] = gsf__vis_apart(job, job->eye, i, &sight, &tracked);
-        if (!(job->apart[i] >= 0.0f)) continue;
-        const int bin = gsf__vis_bin(job->apart[i]);
-        job->evidence[i] = (float)(tracked ? job->found[bin] : job->missed[bin]);
+    for (const gsf__look* look = job->looks; look < job->looks + job->look_count; look++) {
+        const int outside = gsf__vis_side(look->eye, job->regions + 6 * chunk) < 0;
+        for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
+            gsf__sight sight;
+            int tracked;
+            look->apart[i] = -1.0f;
+            look->evidence[i] = 0.0f;
+            if (outside || !gsf__vis_sight(job, look->eye, i, &sight)) continue;
+            look->apart[i] = gsf__vis_apart(job, look->eye, i, &sight, &tracked);
+            if (!(look->apart[i] >= 0.0f)) continue;
+            const int bin = gsf__vis_bin(look->apart[i]);
+            look->evidence[i] = (float)(tracked ? job->found[bin] : job->missed[bin]);
+        }
     }
 }
 
-// Returns the cover at which point i counts as hidden from the current eye. The weights are a logistic fit on three
-// ray-traced scenes, in units of desc->coverage; the constant term is tuned for the union over several views.
-static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
+// Returns the cover at which point i counts as hidden from an eye. The weights are a logistic fit on three ray-traced
+// scenes, in units of desc->coverage; the constant term is tuned for the union over several views.
+static float gsf__vis_limit(const gsf__vis_job* job, const gsf__look* look, size_t i) {
     const gsf__discs* discs = &job->discs;
-    if (!job->evidence) return (float)(double)job->desc->coverage;
+    if (!look->evidence) return (float)(double)job->desc->coverage;
     const size_t near_count = (size_t)discs->near_count;
-    const float *sphere = discs->spheres + 4 * i, *normal = discs->normals + 3 * i;
+    const gsf__disc* disc = discs->all + i;
+    const float* normal = disc->normal;
     double sum = 0.0, along = 0.0, length2 = 0.0, limit = 1.0;
     for (size_t n = 0; n < near_count; n++) { // weighted by how parallel the neighbour's disc is
         const size_t j = discs->nearest[near_count * i + n];
-        const float* other = discs->normals + 3 * j;
+        const float* other = discs->all[j].normal;
         const double same = (double)(normal[0] * other[0] + normal[1] * other[1] + normal[2] * other[2]);
-        sum += same * same * (double)job->evidence[j];
+        sum += same * same * (double)look->evidence[j];
     }
     if (near_count) sum *= 12.0 / (double)near_count;
     limit += 0.095 * (sum < 12.0 ? sum : 12.0); // capped, as neighbours may be visible where the point is hidden
-    if (job->apart[i] >= 0.0f) limit -= 0.15 + 0.85 * (double)(job->apart[i] < 1.0f ? job->apart[i] : 1.0f);
+    if (look->apart[i] >= 0.0f) limit -= 0.15 + 0.85 * (double)(look->apart[i] < 1.0f ? look->apart[i] : 1.0f);
     for (int k = 0; k < 3; k++) {
-        const double d = (double)sphere[k] - job->eye->center[k];
+        const double d = (double)disc->center[k] - look->eye->center[k];
         along += d * (double)normal[k];
         length2 += d * d;
     }
@@ -5477,9 +5526,15 @@ static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
     return (float)((double)job->desc->coverage * limit);
 }
 
-// Makes an eye the current one.
+// Prepares the looks of eye e and those after it, as many as are tested together.
 static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
-    job->eye = job->eyes + e;
+    for (job->look_count = 0; job->look_count < GSF__VIS_LOOKS && e < job->eye_count; e++) {
+        const size_t from = job->discs.count * job->look_count;
+        gsf__look* look = job->looks + job->look_count++;
+        look->eye = job->eyes + e;
+        look->apart = job->apart ? job->apart + from : NULL;
+        look->evidence = job->evidence ? job->evidence + from : NULL;
+    }
     if (job->evidence) gsf__vis_run(ctx, job, gsf__vis_evidence_chunk);
 }
 
@@ -5489,13 +5544,13 @@ typedef struct gsf__vis_disc {
 } gsf__vis_disc;
 
 static gsf__vis_disc gsf__vis_disc_of(const gsf__vis_job* job, const gsf__eye* eye, size_t j) {
-    const float *sphere = job->discs.spheres + 4 * j, *normal = job->discs.normals + 3 * j;
+    const gsf__disc* of = job->discs.all + j;
     gsf__vis_disc disc;
     disc.plane = 0.0;
-    disc.radius = (double)sphere[3];
+    disc.radius = (double)of->radius;
     for (int k = 0; k < 3; k++) {
-        disc.d[k] = (double)sphere[k] - eye->center[k];
-        disc.normal[k] = (double)normal[k];
+        disc.d[k] = (double)of->center[k] - eye->center[k];
+        disc.normal[k] = (double)of->normal[k];
         disc.plane += disc.d[k] * disc.normal[k];
     }
     return disc;
@@ -5529,7 +5584,8 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     gsf__vis_counts* counts = job->counts + chunk;
-    const gsf_camera* camera = &job->eye->camera;
+    const gsf__eye* eye = job->look->eye;
+    const gsf_camera* camera = &eye->camera;
     const double *m = camera->w2c, sx = (double)job->side / (double)camera->width;
     const double sy = (double)job->side / (double)camera->height;
     const size_t first = chunk * GSF__VIS_CHUNK;
@@ -5540,8 +5596,8 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
         job->cells[i] = -1;
         job->cover[i] = 0.0;
         if (!job->seen[i]) {
-            if (gsf__vis_sight(job, job->eye, i, job->sights + i) &&
-                (job->limits[i] = gsf__vis_limit(job, i)) > 0.0f) {
+            if (gsf__vis_sight(job, eye, i, job->sights + i) &&
+                (job->limits[i] = gsf__vis_limit(job, job->look, i)) > 0.0f) {
                 const int32_t x = (int32_t)(job->sights[i].u * sx), y = (int32_t)(job->sights[i].v * sy);
                 job->cells[i] = (y < job->side ? y : job->side - 1) * job->side + (x < job->side ? x : job->side - 1);
                 counts->rays++;
@@ -5549,18 +5605,19 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
                 counts->culled++;
             }
         }
-        const float *sphere = job->discs.spheres + 4 * i, *normal = job->discs.normals + 3 * i;
+        const gsf__disc* disc = job->discs.all + i;
+        const float* normal = disc->normal;
         double d[3], c[3], e[3];
-        for (int k = 0; k < 3; k++) d[k] = (double)sphere[k] - job->eye->center[k];
+        for (int k = 0; k < 3; k++) d[k] = (double)disc->center[k] - eye->center[k];
         for (int r = 0; r < 3; r++) { // centre and half extent along the camera's axes
             const double n = m[r] * (double)normal[0] + m[4 + r] * (double)normal[1] + m[8 + r] * (double)normal[2];
             c[r] = m[r] * d[0] + m[4 + r] * d[1] + m[8 + r] * d[2];
-            e[r] = (double)sphere[3] * (sqrt(n * n < 1.0 ? 1.0 - n * n : 0.0) + 1e-6);
+            e[r] = (double)disc->radius * (sqrt(n * n < 1.0 ? 1.0 - n * n : 0.0) + 1e-6);
         }
         gsf__disc_box* box = job->boxes + i;
         box->x0 = box->x1 = box->y0 = box->y1 = 0;
         if (c[2] + e[2] <= 0.0) continue;
-        if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: may project anywhere
+        if (c[2] - e[2] <= 1e-3 * (double)disc->radius) { // reaches behind the eye: may project anywhere
             box->x1 = box->y1 = all->y1 = (int16_t)job->side;
             all->y0 = 0;
             continue;
@@ -5590,13 +5647,13 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
             continue;
         }
         if (box->x0 >= box->x1 || box->y0 >= y1 || box->y1 <= y0) continue;
-        const gsf__vis_disc disc = gsf__vis_disc_of(job, job->eye, j);
+        const gsf__vis_disc disc = gsf__vis_disc_of(job, job->look->eye, j);
         for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
             const uint32_t* row = job->cell_begin + y * job->side; // the points of a row of cells are contiguous
             for (uint32_t k = row[box->x0]; k < row[box->x1]; k++) {
                 const uint32_t i = job->cell_points[k];
                 if (i != j && job->cover[i] < (double)job->limits[i])
-                    job->cover[i] += gsf__vis_cover(&disc, job->sights + i, (double)job->discs.spheres[4 * i + 3], tolerance);
+                    job->cover[i] += gsf__vis_cover(&disc, job->sights + i, (double)job->discs.all[i].radius, tolerance);
             }
         }
     }
@@ -5620,7 +5677,8 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     job->cell_begin = (uint32_t*)gsf__arena_alloc(&job->arena, cell_count + 2, sizeof(uint32_t));
     if (job->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t e = 0; e < job->eye_count; e++) {
-        gsf__vis_look(ctx, job, e);
+        if (e % GSF__VIS_LOOKS == 0) gsf__vis_look(ctx, job, e);
+        job->look = job->looks + e % GSF__VIS_LOOKS;
         gsf__vis_run(ctx, job, gsf__vis_project_chunk);
         // Counting sort: begin[c + 2] counts the points of cell c, then begin[c + 1] is its insertion point.
         uint32_t* begin = job->cell_begin;
@@ -5682,8 +5740,8 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
     job->regions = (float*)gsf__arena_alloc(&job->arena, chunks, 6 * sizeof(float));
     if (scene->track_begin && scene->track_begin[scene->point_count] > scene->track_begin[0]) {
         job->facing = (float*)gsf__arena_alloc(&job->arena, n, 3 * sizeof(float));
-        job->apart = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
-        job->evidence = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
+        job->apart = (float*)gsf__arena_alloc(&job->arena, n, GSF__VIS_LOOKS * sizeof(float));
+        job->evidence = (float*)gsf__arena_alloc(&job->arena, n, GSF__VIS_LOOKS * sizeof(float));
     }
     if (job->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < job->discs.count; i++) job->seen[i] = keep[job->discs.rows[i]];
@@ -5757,25 +5815,29 @@ GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* sc
 
 #ifdef GSF_USE_EMBREE
 
-/* In a dense cloud most points are hidden from most views, and neighbouring points are hidden by the same discs. So
-   groups of sixteen neighbouring points are first tested, in float with bounds on all rounding errors, against the discs
-   that hid the previous group, then against the neighbours of those discs that cover a point, and then against the discs
-   that hid them from an earlier eye, with their neighbours. Only points that these tests do not prove hidden are traced
-   with Embree. */
-enum { GSF__VIS_GROUP = 16, GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
+/* In a dense cloud most points are hidden from most views, neighbouring points are hidden by the same discs, and so is a
+   point from the next view. So groups of sixteen neighbouring points are first tested, in float with bounds on all rounding
+   errors, against the discs that hid the previous group and those that hid such a group from the previous eye, then against
+   the neighbours of the discs that cover a point. Only points that these tests do not prove hidden are traced with Embree.
+   Every chunk of points is tested for several eyes in turn, so that the discs stay in the cache. */
+enum { GSF__VIS_GROUP = 16, GSF__VIS_GROUPS = GSF__VIS_CHUNK / GSF__VIS_GROUP, GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
 struct gsf__rays {
-    float direction[3][GSF__VIS_GROUP], distance[GSF__VIS_GROUP];
+    GSF__LINES float direction[3][GSF__VIS_GROUP];
+    float distance[GSF__VIS_GROUP];
+    float error[GSF__VIS_GROUP]; // ten times a bound of that of a distance along the ray, times a slope
     float own[GSF__VIS_GROUP];   // tolerance times the radius of the point's own disc
     float cover[GSF__VIS_GROUP]; // lower bound of the cover so far
     float need[GSF__VIS_GROUP];  // cover at which the point is hidden
+    float eye[3], rest[3];       // the eye is at the sum of these
+    float tolerance;
 };
 
-struct gsf__hider { // a disc that may hide points, relative to the eye
-    // plane: distance of the disc's plane from the eye; inverse2: 1 / radius^2; reach: tolerance times radius
-    float center[3], normal[3], plane, inverse2, reach;
-    uint32_t disc;
-    int32_t covered; // bits: rays of the current group that it covers
+struct gsf__hiders { // discs that may hide points, in the order in which they are tested
+    int count, next;                  // next: the first that was not tested
+    uint32_t discs[GSF__VIS_QUEUE];
+    uint16_t covered[GSF__VIS_QUEUE]; // bits: rays of the group that it covers
+    uint64_t queued[16];              // bit set of the discs, by disc modulo 1024
 };
 
 #define GSF__KERNELS "gsfixer_splat.h"
@@ -5789,35 +5851,37 @@ struct gsf__hider { // a disc that may hide points, relative to the eye
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_HIDE
 
-// Adds lower bounds of the discs' cover to the rays, disc by disc from *next on, until none of the rays `open` (bits) remains
-// that is not proved hidden. Returns those that remain; *next: the first disc that was not tested.
-GSF__V_KERNEL int GSF__V(gsf__hide)(gsf__rays* rays, gsf__hider* hiders, int count, int open, int* next) {
+// Adds lower bounds of the discs' cover to the rays, disc by disc, until none of the rays `open` (bits) remains that is not
+// proved hidden. Returns those that remain.
+GSF__V_KERNEL int GSF__V(gsf__hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, int open) {
     const gsf__vf one = gsf__v_set(1.0f), zero = gsf__v_set(0.0f);
-    for (; open && *next < count; (*next)++) {
-        gsf__hider* hider = hiders + *next;
-        const float *c = hider->center, *n = hider->normal;
+    for (; open && hiders->next < hiders->count; hiders->next++) {
+        const gsf__disc* disc = discs + hiders->discs[hiders->next];
+        const float* n = disc->normal;
+        const float cx = (disc->center[0] - rays->eye[0]) - rays->rest[0]; // as precise as if it were rounded from double
+        const float cy = (disc->center[1] - rays->eye[1]) - rays->rest[1];
+        const float cz = (disc->center[2] - rays->eye[2]) - rays->rest[2];
+        const float plane = cx * n[0] + cy * n[1] + cz * n[2], reach = rays->tolerance * disc->radius;
         uint32_t covered = 0, left = 0;
         for (int l = 0; l < GSF__VIS_GROUP; l += GSF__LANES) {
             const gsf__vf distance = gsf__v_load(rays->distance + l), x = gsf__v_load(rays->direction[0] + l);
             const gsf__vf y = gsf__v_load(rays->direction[1] + l), z = gsf__v_load(rays->direction[2] + l);
             const gsf__vf slope = gsf__v_madd(x, gsf__v_set(n[0]), gsf__v_madd(y, gsf__v_set(n[1]), z * gsf__v_set(n[2])));
-            const gsf__vf inverse = one / slope, t = gsf__v_set(hider->plane) * inverse;
-            const gsf__vf error = gsf__v_set(1e-6f) * distance * gsf__v_abs(inverse);
-            const gsf__vf gap = distance - t - gsf__v_max(gsf__v_load(rays->own + l), gsf__v_set(hider->reach));
-            const gsf__vf qx = gsf__v_msub(t, x, gsf__v_set(c[0])), qy = gsf__v_msub(t, y, gsf__v_set(c[1]));
-            const gsf__vf qz = gsf__v_msub(t, z, gsf__v_set(c[2]));
-            const gsf__vf length2 = gsf__v_madd(qx, qx, gsf__v_madd(qy, qy, qz * qz));
-            const gsf__vf q2 = gsf__v_madd(gsf__v_set(1.01f), length2, // >= (q + error)^2
-                                           gsf__v_set(101.0f) * (error * error));
-            const gsf__vf cover = gsf__v_nmadd(q2, gsf__v_set(hider->inverse2), one);
-            const gsf__vm hit = gsf__vm_and(gsf__v_gt(t, error),
-                                            gsf__vm_and(gsf__v_gt(gap, error + error), gsf__v_gt(cover, zero)));
+            const gsf__vf inverse = one / slope, t = gsf__v_set(plane) * inverse;
+            const gsf__vf error = gsf__v_load(rays->error + l) * gsf__v_abs(inverse); // ten times that of t and of the crossing
+            const gsf__vf gap = distance - gsf__v_max(gsf__v_load(rays->own + l), gsf__v_set(reach)) - t;
+            const gsf__vf qx = gsf__v_msub(t, x, gsf__v_set(cx)), qy = gsf__v_msub(t, y, gsf__v_set(cy));
+            const gsf__vf qz = gsf__v_msub(t, z, gsf__v_set(cz));
+            // (q + e)^2 <= 1.01 (q^2 + 100 e^2) for the distance q of the crossing from the disc's centre
+            const gsf__vf q2 = gsf__v_madd(qx, qx, gsf__v_madd(qy, qy, gsf__v_madd(qz, qz, error * error)));
+            const gsf__vf cover = gsf__v_nmadd(q2, gsf__v_set(1.01f * disc->inverse2), one);
+            const gsf__vm hit = gsf__vm_and(gsf__v_gt(t, error), gsf__vm_and(gsf__v_gt(gap, error), gsf__v_gt(cover, zero)));
             const gsf__vf sum = gsf__v_load(rays->cover + l) + gsf__v_keep(hit, cover);
             gsf__v_store(rays->cover + l, sum);
             covered |= gsf__vm_bits(hit) << l;
             left |= gsf__vm_bits(gsf__v_lt(sum, gsf__v_load(rays->need + l))) << l;
         }
-        hider->covered = (int32_t)covered;
+        hiders->covered[hiders->next] = (uint16_t)covered;
         open &= (int)left;
     }
     return open;
@@ -5834,36 +5898,27 @@ typedef struct gsf__embree_query { // starts with Embree's context, whose addres
     struct RTCRayQueryContext context;
 #endif
     const gsf__vis_job* job;
-    const gsf__eye* eye;
+    const gsf__look* look;
     // the current ray
     gsf__sight sight;
     size_t point;
-    double cover, limit;              // cover of the discs hit so far; cover at which the point is hidden
-    double most;                      // cover of the disc that covers it most
-    uint32_t hider;                   // that disc
+    double cover, limit;  // cover of the discs hit so far; cover at which the point is hidden
     // the current group of points
     size_t points[GSF__VIS_GROUP];
     int ray_count;
     gsf__rays rays;
-    gsf__hider queue[GSF__VIS_QUEUE]; // starts with discs that covered points of the previous group
-    int queue_count;
-    uint64_t queued[16];              // bit set of the discs in the queue, by disc modulo 1024
+    gsf__hiders hiders;   // starts with discs that covered points of the previous group
+    // of each group of the chunk, some of the discs that covered points of it from the last eye
+    int group, found_count[GSF__VIS_GROUPS];
+    uint32_t found[GSF__VIS_GROUPS][GSF__VIS_HIDERS];
 } gsf__embree_query;
 
-static void gsf__embree_enqueue(gsf__embree_query* q, uint32_t disc) {
-    uint64_t *word = q->queued + (disc >> 6 & 15u), bit = (uint64_t)1 << (disc & 63u);
-    if ((*word & bit) || q->queue_count == GSF__VIS_QUEUE) return;
+static void gsf__hiders_add(gsf__hiders* h, const gsf__discs* discs, uint32_t disc) {
+    uint64_t *word = h->queued + (disc >> 6 & 15u), bit = (uint64_t)1 << (disc & 63u);
+    if ((*word & bit) || h->count == GSF__VIS_QUEUE) return;
     *word |= bit;
-    const float *sphere = q->job->discs.spheres + 4 * (size_t)disc, *normal = q->job->discs.normals + 3 * (size_t)disc;
-    gsf__hider* hider = q->queue + q->queue_count++;
-    for (int k = 0; k < 3; k++) {
-        hider->center[k] = (float)((double)sphere[k] - q->eye->center[k]);
-        hider->normal[k] = normal[k];
-    }
-    hider->plane = hider->center[0] * normal[0] + hider->center[1] * normal[1] + hider->center[2] * normal[2];
-    hider->inverse2 = 1.0f / (sphere[3] * sphere[3]);
-    hider->reach = q->job->desc->tolerance * sphere[3];
-    hider->disc = disc;
+    h->discs[h->count++] = disc;
+    gsf__v_fetch_scalar(discs->all[disc].center);
 }
 
 // Embree calls this for every disc that the ray hits, in no particular order. Rejecting the hit continues the
@@ -5876,34 +5931,31 @@ static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
         args->valid[0] = 0;
         return;
     }
-    const gsf__vis_disc disc = gsf__vis_disc_of(q->job, q->eye, hit->primID);
-    const double cover = gsf__vis_cover(&disc, &q->sight, (double)q->job->discs.spheres[4 * (size_t)q->point + 3],
-                                        (double)q->job->desc->tolerance);
+    const gsf__discs* discs = &q->job->discs;
+    const gsf__vis_disc disc = gsf__vis_disc_of(q->job, q->look->eye, hit->primID);
+    const double own = (double)discs->all[q->point].radius;
+    const double cover = gsf__vis_cover(&disc, &q->sight, own, (double)q->job->desc->tolerance);
     q->cover += cover;
     if (q->cover < q->limit) args->valid[0] = 0;
-    if (!(cover > 0.0)) return;
-    gsf__embree_enqueue(q, hit->primID);
-    if (cover > q->most) {
-        q->most = cover;
-        q->hider = hit->primID;
-    }
+    if (cover > 0.0) gsf__hiders_add(&q->hiders, discs, hit->primID);
 }
 
 static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     const gsf__vis_job* job = q->job;
-    if (!gsf__vis_sight(job, q->eye, i, &q->sight)) return;
+    const gsf__eye* eye = q->look->eye;
+    if (!gsf__vis_sight(job, eye, i, &q->sight)) return;
     q->point = i;
-    q->cover = q->most = 0.0;
-    q->limit = (double)gsf__vis_limit(job, i);
+    q->cover = 0.0;
+    q->limit = (double)gsf__vis_limit(job, q->look, i);
     // The ray starts at the eye and ends `tolerance` short of the point. (Starting at the point would depend on Embree's
     // version: some report a disc that contains the origin, others do not.)
-    const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs.spheres[4 * i + 3]);
+    const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs.all[i].radius);
     if (reach > 0.0) {
         struct RTCRay ray;
         memset(&ray, 0, sizeof ray);
-        ray.org_x = (float)q->eye->center[0];
-        ray.org_y = (float)q->eye->center[1];
-        ray.org_z = (float)q->eye->center[2];
+        ray.org_x = (float)eye->center[0];
+        ray.org_y = (float)eye->center[1];
+        ray.org_z = (float)eye->center[2];
         ray.dir_x = (float)q->sight.direction[0];
         ray.dir_y = (float)q->sight.direction[1];
         ray.dir_z = (float)q->sight.direction[2];
@@ -5919,93 +5971,104 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
 #endif
     }
     job->seen[i] = q->cover < q->limit;
-    if (q->most > 0.0) job->hiders[i] = q->hider;
 }
 
-// Tests the rays against the queued discs from *next on, and enqueues the neighbours of discs that cover an open ray.
-// `open`: bits of the rays not yet proved hidden; returns those that remain.
-static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int open) {
+// Tests the rays against the queued discs, and then against the neighbours of discs that cover an open ray. `open`: bits of
+// the rays not yet proved hidden; returns those that remain. *expanded: the first disc whose neighbours are not queued yet.
+static int gsf__embree_meet(gsf__embree_query* q, int* expanded, int open) {
     const gsf__discs* discs = &q->job->discs;
+    gsf__hiders* h = &q->hiders;
     for (;;) {
-        open = q->job->hide(&q->rays, q->queue, q->queue_count, open, next);
+        open = q->job->hide(discs->all, &q->rays, h, open);
         if (!open) return 0;
-        while (*expanded < *next && !(q->queue[*expanded].covered & open)) (*expanded)++;
-        if (*expanded == *next) return open;
-        const uint32_t* nearest = discs->nearest + (size_t)discs->near_count * q->queue[(*expanded)++].disc;
-        for (int n = 0; n < discs->near_count; n++) gsf__embree_enqueue(q, nearest[n]);
+        while (*expanded < h->next && !(h->covered[*expanded] & open)) (*expanded)++;
+        if (*expanded == h->next) return open;
+        const uint32_t* nearest = discs->nearest + (size_t)discs->near_count * h->discs[(*expanded)++];
+        for (int n = 0; n < discs->near_count; n++) gsf__hiders_add(h, discs, nearest[n]);
     }
 }
 
 static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
+    gsf__hiders* h = &q->hiders;
+    uint32_t* found = q->found[q->group];
+    int* found_count = q->found_count + q->group++;
     for (int l = q->ray_count; l < GSF__VIS_GROUP; l++) { // unused lanes
         q->rays.direction[0][l] = q->rays.direction[1][l] = q->rays.direction[2][l] = 0.0f;
-        q->rays.distance[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
+        q->rays.distance[l] = q->rays.error[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
     }
-    int next = 0, expanded = 0, open = gsf__embree_meet(q, &next, &expanded, (1 << q->ray_count) - 1);
-    for (int l = 0; l < q->ray_count; l++) {
-        const uint32_t hider = q->job->hiders[q->points[l]];
-        if ((open >> l & 1) && hider != UINT32_MAX) gsf__embree_enqueue(q, hider);
-    }
-    open = gsf__embree_meet(q, &next, &expanded, open);
+    for (int k = 0; k < *found_count; k++) gsf__hiders_add(h, &q->job->discs, found[k]);
+    int expanded = 0, open = gsf__embree_meet(q, &expanded, (1 << q->ray_count) - 1);
     for (int l = 0; l < q->ray_count; l++) {
         counts->rays += open >> l & 1;
         counts->culled += !(open >> l & 1);
         if (!(open >> l & 1)) continue;
         gsf__embree_ray(q, q->points[l]);
-        open = gsf__embree_meet(q, &next, &expanded, open & ~(1 << l)); // discs that the ray found may hide the others
+        open = gsf__embree_meet(q, &expanded, open & ~(1 << l)); // discs that the ray found may hide the others
     }
-    memset(q->queued, 0, sizeof q->queued);
-    q->queue_count = q->ray_count = 0;
-    for (int k = 0; k < next && q->queue_count < GSF__VIS_HIDERS; k++) {
-        if (!q->queue[k].covered) continue;
-        const uint32_t disc = q->queue[k].disc;
-        q->queued[disc >> 6 & 15u] |= (uint64_t)1 << (disc & 63u);
-        q->queue[q->queue_count++] = q->queue[k];
+    *found_count = q->ray_count = h->count = 0;
+    memset(h->queued, 0, sizeof h->queued);
+    for (int k = 0; k < h->next && *found_count < GSF__VIS_HIDERS; k++) {
+        if (!h->covered[k]) continue;
+        gsf__hiders_add(h, &q->job->discs, h->discs[k]); // at or before its old place
+        found[(*found_count)++] = h->discs[k];
     }
+    h->next = 0;
+}
+
+// Tests the points of a chunk that no eye has seen yet for one eye.
+static void gsf__embree_look(gsf__embree_query* q, const gsf__look* look, size_t chunk, gsf__vis_counts* counts) {
+    const gsf__vis_job* job = q->job;
+    gsf__rays* rays = &q->rays;
+    const size_t first = chunk * GSF__VIS_CHUNK;
+    const int side = gsf__vis_side(look->eye, job->regions + 6 * chunk);
+    const float grazing = job->desc->min_grazing_cos + 1e-5f;
+    q->look = look;
+    q->group = q->hiders.count = 0;
+    memset(q->hiders.queued, 0, sizeof q->hiders.queued);
+    for (int k = 0; k < 3; k++) {
+        rays->eye[k] = (float)look->eye->center[k];
+        rays->rest[k] = (float)(look->eye->center[k] - (double)rays->eye[k]);
+    }
+    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
+        if (job->seen[i]) continue;
+        const gsf__disc* disc = job->discs.all + i;
+        const int l = q->ray_count;
+        float d[3];
+        for (int k = 0; k < 3; k++) d[k] = (disc->center[k] - rays->eye[k]) - rays->rest[k];
+        const float distance = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), inverse = 1.0f / distance;
+        for (int k = 0; k < 3; k++) rays->direction[k][l] = d[k] * inverse;
+        const float cosine = (d[0] * disc->normal[0] + d[1] * disc->normal[1] + d[2] * disc->normal[2]) * inverse;
+        const int clear = side > 0 && fabsf(cosine) > grazing; // otherwise gsf__vis_sight decides in double
+        float limit = 0.0f;
+        if (clear || (side >= 0 && gsf__vis_sight(job, look->eye, i, &q->sight))) limit = gsf__vis_limit(job, look, i);
+        if (!(limit > 0.0f)) {
+            counts->culled++;
+            continue;
+        }
+        q->points[l] = i;
+        rays->distance[l] = distance;
+        rays->error[l] = 1e-5f * distance;
+        rays->own[l] = job->desc->tolerance * disc->radius;
+        rays->cover[l] = 0.0f;
+        rays->need[l] = limit * 1.00001f;
+        if (++q->ray_count == GSF__VIS_GROUP) gsf__embree_group(q, counts);
+    }
+    if (q->ray_count) gsf__embree_group(q, counts);
 }
 
 static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
-    gsf__vis_counts* counts = job->counts + chunk;
-    const size_t first = chunk * GSF__VIS_CHUNK;
-    const int side = gsf__vis_side(job->eye, job->regions + 6 * chunk);
     gsf__embree_query query;
-    gsf__rays* rays = &query.rays;
+    memset(&query, 0, sizeof query);
     query.job = job;
-    query.eye = job->eye;
-    query.queue_count = query.ray_count = 0;
-    memset(query.queued, 0, sizeof query.queued);
+    query.rays.tolerance = job->desc->tolerance;
 #if RTC_VERSION_MAJOR < 4
     rtcInitIntersectContext(&query.context);
 #else
     rtcInitRayQueryContext(&query.context);
 #endif
-    const float grazing = job->desc->min_grazing_cos + 1e-5f;
-    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
-        if (job->seen[i]) continue;
-        const float *sphere = job->discs.spheres + 4 * i, *normal = job->discs.normals + 3 * i;
-        const int l = query.ray_count;
-        float d[3];
-        for (int k = 0; k < 3; k++) d[k] = (float)((double)sphere[k] - query.eye->center[k]);
-        const float distance = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), inverse = 1.0f / distance;
-        for (int k = 0; k < 3; k++) rays->direction[k][l] = d[k] * inverse;
-        const float cosine = (d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]) * inverse;
-        const int clear = side > 0 && fabsf(cosine) > grazing; // otherwise gsf__vis_sight decides in double
-        float limit = 0.0f;
-        if (clear || (side >= 0 && gsf__vis_sight(job, query.eye, i, &query.sight))) limit = gsf__vis_limit(job, i);
-        if (!(limit > 0.0f)) {
-            counts->culled++;
-            continue;
-        }
-        query.points[l] = i;
-        rays->distance[l] = distance;
-        rays->own[l] = job->desc->tolerance * sphere[3];
-        rays->cover[l] = 0.0f;
-        rays->need[l] = limit * 1.00001f;
-        if (++query.ray_count == GSF__VIS_GROUP) gsf__embree_group(&query, counts);
-    }
-    if (query.ray_count) gsf__embree_group(&query, counts);
+    for (size_t k = 0; k < job->look_count; k++) gsf__embree_look(&query, job->looks + k, chunk, job->counts + chunk);
 }
 
 // Running out of memory inside Embree or TBB does not always end in an error code: a C++ exception that reaches a
@@ -6031,10 +6094,10 @@ static bool gsf__embree_may_allocate(void* refused, ssize_t bytes, bool post) {
 static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const gsf__vis_job* job) {
     RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_ORIENTED_DISC_POINT);
     if (geometry) {
-        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT4, job->discs.spheres, 0,
-                                   4 * sizeof(float), job->discs.count);
-        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_NORMAL, 0, RTC_FORMAT_FLOAT3, job->discs.normals, 0,
-                                   3 * sizeof(float), job->discs.count);
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT4, job->discs.all, 0,
+                                   sizeof(gsf__disc), job->discs.count);
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_NORMAL, 0, RTC_FORMAT_FLOAT3, job->discs.all,
+                                   offsetof(gsf__disc, normal), sizeof(gsf__disc), job->discs.count);
         rtcSetGeometryOccludedFilterFunction(geometry, gsf__embree_filter);
         rtcCommitGeometry(geometry);
         rtcAttachGeometry(scene, geometry);
@@ -6047,10 +6110,7 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
     job->hide = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__hide);
-    job->hiders = (uint32_t*)gsf__arena_alloc(&job->arena, job->discs.count, sizeof(uint32_t));
-    if (!job->hiders) return GSF_ERROR_OUT_OF_MEMORY;
-    memset(job->hiders, 0xff, job->discs.count * sizeof(uint32_t));
-    for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
+    for (size_t e = 0; result == GSF_OK && e < job->eye_count; e += GSF__VIS_LOOKS) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
         result = gsf__check_cancel(ctx);
@@ -7480,14 +7540,6 @@ typedef struct gsf__step { // kept by backward per splat and 8 pixels
 } gsf__step;
 
 typedef struct gsf__wide_step { float alpha[16], T[16]; } gsf__wide_step; // the same, by kernels with 16 lanes
-
-// Before an array or a variable that kernels read in whole cache lines: a vector across two is slow to load, and slower
-// to load soon after it was stored.
-#if defined(__GNUC__) || defined(__clang__)
-#define GSF__LINES __attribute__((aligned(64)))
-#else
-#define GSF__LINES
-#endif
 
 typedef struct gsf__step_head { uint32_t entry; uint32_t step; } gsf__step_head;
 

@@ -51,7 +51,7 @@ static void check_neighbours(int kind, size_t count, int k) {
         double distance2[GSF__KNN_MAX];
         size_t places[GSF__KNN_MAX];
         const double* q = tree.points + 3 * i;
-        const int found = gsf__knn_query(&tree, q, i, k, distance2, places);
+        const int found = gsf__knn_query(&tree, q, i, INFINITY, k, distance2, places);
         size_t n = 0;
         for (size_t j = 0; j < count; j++) {
             if (j == tree.rows[i]) continue;
@@ -98,7 +98,7 @@ static void test_neighbours(void) {
         for (size_t i = 0; i < many; i++) {
             double distance2[12];
             size_t places[12];
-            const int found = gsf__knn_query(&tree, tree.points + 3 * i, i, 12, distance2, places);
+            const int found = gsf__knn_query(&tree, tree.points + 3 * i, i, INFINITY, 12, distance2, places);
             sum += found == 12 ? distance2[11] : NAN;
         }
         CHECK(isfinite(sum));
@@ -340,17 +340,18 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
     CHECK_OK(&ctx, gsf__vis_begin(&ctx, scene, views, count, &desc, keep, &job, &stats));
     for (size_t e = 0; e < count; e++) {
         gsf__vis_look(&ctx, &job, e);
+        const gsf__look* look = job.looks;
         for (size_t i = 0; i < job.discs.count; i++) {
             const size_t row = job.discs.rows[i];
             gsf__sight sight;
-            if (!gsf__vis_sight(&job, job.eye, i, &sight)) continue;
-            const double limit = (double)gsf__vis_limit(&job, i);
+            if (!gsf__vis_sight(&job, look->eye, i, &sight)) continue;
+            const double limit = (double)gsf__vis_limit(&job, look, i);
             double cover[3] = {0.0, 0.0, 0.0}; // outer two: with zero tolerance, rounding decides about discs in the plane
             for (int k = tolerance > 0.0f; k < 3 - (tolerance > 0.0f); k++) {
                 desc.tolerance = tolerance + close * (float)(k - 1);
                 for (size_t j = 0; j < job.discs.count; j++) {
-                    const gsf__vis_disc disc = gsf__vis_disc_of(&job, job.eye, j);
-                    const double own = (double)job.discs.spheres[4 * i + 3];
+                    const gsf__vis_disc disc = gsf__vis_disc_of(&job, look->eye, j);
+                    const double own = (double)job.discs.all[i].radius;
                     if (j != i) cover[k] += gsf__vis_cover(&disc, &sight, own, (double)desc.tolerance);
                 }
             }
