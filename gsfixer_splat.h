@@ -112,8 +112,8 @@
                on workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
                convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
-               >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
-               >>render >>loss >>adam >>densify >>trainer >>carry >>warp >>seen mask >>fixer >>few views
+               >>embree >>stereo >>rasterizer state >>project >>depth order >>bin >>raster forward >>raster backward
+               >>project backward >>render >>loss >>adam >>densify >>trainer >>carry >>warp >>seen mask >>fixer >>few views
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -7479,9 +7479,9 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
 
 /* Stages of a frame:
        project   every splat -> one 64-byte record (screen ellipse, colour), with radius 0 if it is not drawn
-       bin       append each splat, in index order, to the lists of the 16x16 tiles that its ellipse overlaps; each
-                 (splat, tile) pair owns a slot for that tile's share of the splat's gradient
-       sort      sort each tile's list by depth, ties by index (radix sort of the float's bits)
+       sort      the drawn splats by depth, ties by index (radix sort of the float's bits)
+       bin       append each splat, in that order, to the lists of the 16x16 tiles that its ellipse overlaps; each entry
+                 owns a slot for that tile's share of the splat's gradient
        forward   per tile: blend front to back, in steps of 4 x 2 pixels or, with AVX-512, 4 x 4
        backward  per tile: repeat forward, keeping alpha and T of every step; then go back to front
        gather    per splat: sum its slots in tile order, then backpropagate through the projection to the parameters
@@ -7550,14 +7550,16 @@ typedef struct gsf__worker_scratch { // one per worker
     uint32_t* checkpoint_entry; // the list entry that each bucket starts with
 } gsf__worker_scratch;
 
-typedef struct gsf__pair { uint32_t splat, slot; } gsf__pair; // slot: relative to the tile's first
-
 struct gsf_rasterizer {
     size_t splat_capacity;
     gsf__record* records;      // per splat
     int32_t* radii;            // per splat
-    size_t* splat_begin;       // (splats + 1) start of each splat's part of splat_pairs
-    size_t pair_count;
+    size_t* splat_begin;       // (splats + 1) start of each splat's part of splat_entries
+    uint64_t *order, *order_spare; // depth bits << 32 | index of each splat, in order of depth; scratch of the sort
+    gsf__tile_span* rows;      // of the splat at each place of the order: first tile row and one past the last
+    size_t drawn_count;        // at the start of the order
+    size_t digit_capacity;
+    uint32_t* digits;          // (chunks, 2^GSF__ORDER_BITS) while sorting: of each value of the key's digit
 
     size_t tile_capacity;      // of tile_begin
     size_t* tile_begin;        // (tiles + 1) start of each tile's list
@@ -7565,15 +7567,12 @@ struct gsf_rasterizer {
     uint32_t* tile_counts;     // (chunks, tiles) while binning
     size_t span_capacity;
     gsf__tile_span* spans;     // of each splat's tile rows, while binning
-    size_t pair_capacity;
-    uint32_t* pair_splat;      // the splats of each tile, in index order
-    uint32_t* splat_pairs;     // the indices of each splat in pair_splat, in tile order
-    uint64_t* pair_keys;       // sort keys: depth bits << 32 | index in the tile's part of pair_splat
-    uint64_t* pair_spare;      // scratch of the sort
-    gsf__pair* pairs;          // the lists in depth order, for the raster loops
+    size_t entry_count, entry_capacity;
+    uint32_t* entries;         // the lists: the splats of each tile, front to back
+    uint32_t* splat_entries;   // the indices of each splat in `entries`, in tile order
     size_t slot_capacity;
-    float* slots;              // (pairs, GSF__SLOT_FLOATS) gradient of each pair, indexed like pair_splat
-    uint8_t* slot_used;        // (pairs) 1 if backward blended the splat into some pixel and filled the slot
+    float* slots;              // (entries, GSF__SLOT_FLOATS) gradient of each entry
+    uint8_t* slot_used;        // (entries) 1 if backward blended the splat into some pixel and filled the slot
 
     size_t pixel_capacity;
     float* final_T;            // per pixel, of the last render
@@ -7604,8 +7603,8 @@ GSF_API gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** 
 
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
-    void* const owned[] = {r->records, r->radii, r->splat_begin, r->tile_begin, r->tile_counts, r->spans, r->pair_splat,
-                           r->splat_pairs, r->pair_keys, r->pair_spare, r->pairs, r->slots, r->slot_used, r->final_T,
+    void* const owned[] = {r->records, r->radii, r->splat_begin, r->order, r->order_spare, r->rows, r->digits, r->tile_begin,
+                           r->tile_counts, r->spans, r->entries, r->splat_entries, r->slots, r->slot_used, r->final_T,
                            r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
     r->worker_arena.ctx = ctx;
@@ -8121,6 +8120,85 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
         GSF__ANY_KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
 }
 
+// ---- >>depth order -------------------------------------------------------------
+
+// Sorted once by depth, the splats come to every tile's list in order.
+enum { GSF__ORDER_BITS = 8, GSF__ORDER_VALUES = 1 << GSF__ORDER_BITS, GSF__ORDER_CHUNKS = 32 };
+
+typedef struct gsf__order_job {
+    gsf_rasterizer* r;
+    size_t chunk_size;
+    int shift; // of the digit
+} gsf__order_job;
+
+static size_t gsf__order_end(const gsf__order_job* job, size_t chunk) {
+    const size_t end = (chunk + 1) * job->chunk_size;
+    return end < job->r->splat_count ? end : job->r->splat_count;
+}
+
+static void gsf__order_key_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    const gsf__order_job* job = (const gsf__order_job*)arg;
+    for (size_t i = chunk * job->chunk_size; i < gsf__order_end(job, chunk); i++) {
+        const gsf__record* rec = job->r->records + i;
+        uint32_t depth = UINT32_MAX; // not drawn: at the end
+        if (rec->radius > 0) memcpy(&depth, &rec->depth, sizeof depth); // positive, so its bits sort like the float
+        job->r->order[i] = (uint64_t)depth << 32 | i;
+    }
+}
+
+static void gsf__order_count_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    const gsf__order_job* job = (const gsf__order_job*)arg;
+    uint32_t* digits = job->r->digits + chunk * GSF__ORDER_VALUES;
+    memset(digits, 0, GSF__ORDER_VALUES * sizeof *digits);
+    for (size_t i = chunk * job->chunk_size; i < gsf__order_end(job, chunk); i++)
+        digits[job->r->order[i] >> job->shift & (GSF__ORDER_VALUES - 1)]++;
+}
+
+static void gsf__order_move_chunk(void* arg, size_t chunk, int32_t worker) {
+    (void)worker;
+    const gsf__order_job* job = (const gsf__order_job*)arg;
+    uint32_t* next = job->r->digits + chunk * GSF__ORDER_VALUES;
+    for (size_t i = chunk * job->chunk_size; i < gsf__order_end(job, chunk); i++) {
+        const uint64_t key = job->r->order[i];
+        job->r->order_spare[next[key >> job->shift & (GSF__ORDER_VALUES - 1)]++] = key;
+    }
+}
+
+static gsf_result gsf__order(gsf_context* ctx, gsf_rasterizer* r) {
+    gsf__order_job job;
+    job.r = r;
+    job.chunk_size = r->splat_count / GSF__ORDER_CHUNKS + 1;
+    if (job.chunk_size < 8192) job.chunk_size = 8192;
+    const size_t chunks = (r->splat_count + job.chunk_size - 1) / job.chunk_size;
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->digits, &r->digit_capacity, 0, chunks * GSF__ORDER_VALUES, sizeof(uint32_t)));
+    gsf__parallel_for(ctx, chunks, gsf__order_key_chunk, &job);
+    for (job.shift = 32; job.shift < 64; job.shift += GSF__ORDER_BITS) {
+        gsf__parallel_for(ctx, chunks, gsf__order_count_chunk, &job);
+        uint32_t sum = 0;
+        for (size_t value = 0; value < GSF__ORDER_VALUES; value++)
+            for (size_t c = 0; c < chunks; c++) { // each count becomes the index at which its chunk writes
+                uint32_t* digit = r->digits + c * GSF__ORDER_VALUES + value;
+                const uint32_t count = *digit;
+                *digit = sum;
+                sum += count;
+            }
+        gsf__parallel_for(ctx, chunks, gsf__order_move_chunk, &job);
+        uint64_t* swap = r->order;
+        r->order = r->order_spare;
+        r->order_spare = swap;
+    }
+    size_t low = 0, high = r->splat_count; // where the splats begin that are not drawn
+    while (low < high) {
+        const size_t middle = (low + high) / 2;
+        if (r->order[middle] >> 32 == UINT32_MAX) high = middle;
+        else low = middle + 1;
+    }
+    r->drawn_count = low;
+    return GSF_OK;
+}
+
 // ---- >>bin ---------------------------------------------------------------------
 
 // Tile rows that the splat overlaps: first and one past the last.
@@ -8200,7 +8278,13 @@ static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int
 
 static size_t gsf__bin_end(const gsf__bin_job* job, size_t chunk) {
     const size_t end = (chunk + 1) * job->chunk_size;
-    return end < job->r->splat_count ? end : job->r->splat_count;
+    return end < job->r->drawn_count ? end : job->r->drawn_count;
+}
+
+// The record at place k of the order; those are scattered over memory.
+static const gsf__record* gsf__ordered(const gsf_rasterizer* r, size_t k) {
+    if (k + 16 < r->drawn_count) gsf__v_fetch_scalar(&r->records[(uint32_t)r->order[k + 16]].u);
+    return r->records + (uint32_t)r->order[k];
 }
 
 static void gsf__bin_measure_chunk(void* arg, size_t chunk, int32_t worker) {
@@ -8208,10 +8292,9 @@ static void gsf__bin_measure_chunk(void* arg, size_t chunk, int32_t worker) {
     gsf__bin_job* job = (gsf__bin_job*)arg;
     const size_t end = gsf__bin_end(job, chunk);
     size_t count = GSF__SPANS; // that many are written together
-    for (size_t i = chunk * job->chunk_size; i < end; i++) {
-        const gsf__record* rec = job->r->records + i;
-        if (rec->radius <= 0) continue;
-        const gsf__tile_span rows = gsf__tile_rows(job->r, job->view, rec);
+    for (size_t k = chunk * job->chunk_size; k < end; k++) {
+        const gsf__tile_span rows = gsf__tile_rows(job->r, job->view, gsf__ordered(job->r, k));
+        job->r->rows[k] = rows;
         count += (size_t)(rows.x1 - rows.x0);
     }
     job->spans[chunk] = count;
@@ -8224,19 +8307,17 @@ static void gsf__bin_count_chunk(void* arg, size_t chunk, int32_t worker) {
     uint32_t* counts = r->tile_counts + chunk * (size_t)r->tiles_x * (size_t)r->tiles_y;
     gsf__tile_span* span = r->spans + job->spans[chunk];
     const size_t end = gsf__bin_end(job, chunk);
-    for (size_t i = chunk * job->chunk_size; i < end; i++) {
-        const gsf__record* rec = r->records + i;
-        size_t pairs = 0;
-        if (rec->radius > 0) {
-            const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
-            for (int32_t ty = rows.x0; ty < rows.x1; ty += GSF__SPANS)
-                gsf__tile_spans(job, rec, ty, rows.x1 - ty, span + (ty - rows.x0));
-            for (int32_t ty = rows.x0; ty < rows.x1; ty++, span++) {
-                uint32_t* row = counts + (size_t)ty * (size_t)r->tiles_x;
-                for (int32_t tx = span->x0; tx < span->x1; tx++, pairs++) row[tx]++;
-            }
+    for (size_t k = chunk * job->chunk_size; k < end; k++) {
+        const gsf__record* rec = gsf__ordered(r, k);
+        const gsf__tile_span rows = r->rows[k];
+        size_t entries = 0;
+        for (int32_t ty = rows.x0; ty < rows.x1; ty += GSF__SPANS)
+            gsf__tile_spans(job, rec, ty, rows.x1 - ty, span + (ty - rows.x0));
+        for (int32_t ty = rows.x0; ty < rows.x1; ty++, span++) {
+            uint32_t* row = counts + (size_t)ty * (size_t)r->tiles_x;
+            for (int32_t tx = span->x0; tx < span->x1; tx++, entries++) row[tx]++;
         }
-        r->splat_begin[i + 1] = pairs;
+        r->splat_begin[(uint32_t)r->order[k] + 1] = entries;
     }
 }
 
@@ -8247,37 +8328,17 @@ static void gsf__bin_fill_chunk(void* arg, size_t chunk, int32_t worker) {
     uint32_t* next = r->tile_counts + chunk * (size_t)r->tiles_x * (size_t)r->tiles_y;
     const gsf__tile_span* span = r->spans + job->spans[chunk];
     const size_t end = gsf__bin_end(job, chunk);
-    for (size_t i = chunk * job->chunk_size; i < end; i++) {
-        if (r->records[i].radius <= 0) continue;
-        const gsf__tile_span rows = gsf__tile_rows(r, job->view, r->records + i);
-        uint32_t* pair = r->splat_pairs + r->splat_begin[i];
-        for (int32_t ty = rows.x0; ty < rows.x1; ty++, span++) {
+    for (size_t k = chunk * job->chunk_size; k < end; k++) {
+        const uint32_t splat = (uint32_t)r->order[k];
+        uint32_t* entry = r->splat_entries + r->splat_begin[splat];
+        for (int32_t ty = r->rows[k].x0; ty < r->rows[k].x1; ty++, span++) {
             uint32_t* row = next + (size_t)ty * (size_t)r->tiles_x;
             for (int32_t tx = span->x0; tx < span->x1; tx++) {
                 const uint32_t at = row[tx]++;
-                r->pair_splat[at] = (uint32_t)i;
-                *pair++ = at;
+                r->entries[at] = splat;
+                *entry++ = at;
             }
         }
-    }
-}
-
-static void gsf__sort_tile(void* arg, size_t index, int32_t worker) {
-    (void)worker;
-    const gsf_rasterizer* r = (const gsf_rasterizer*)arg;
-    const size_t first = r->tile_begin[index], count = r->tile_begin[index + 1] - first;
-    const uint32_t* splats = r->pair_splat + first;
-    uint64_t* keys = r->pair_keys + first;
-    for (size_t i = 0; i < count; i++) {
-        uint32_t depth; // positive, so its bits sort like the float
-        memcpy(&depth, &r->records[splats[i]].depth, sizeof depth);
-        keys[i] = (uint64_t)depth << 32 | i;
-    }
-    keys = gsf__sort_keys(keys, r->pair_spare + first, count);
-    for (size_t i = 0; i < count; i++) {
-        gsf__pair* pair = r->pairs + first + i;
-        pair->slot = (uint32_t)keys[i];
-        pair->splat = splats[pair->slot];
     }
 }
 
@@ -8293,12 +8354,13 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     job.r = r;
     job.view = view;
     job.level = ctx->cpu_level;
-    job.chunk_size = r->splat_count / GSF__BIN_CHUNKS + 1;
+    job.chunk_size = r->drawn_count / GSF__BIN_CHUNKS + 1;
     if (job.chunk_size < 1024) job.chunk_size = 1024;
-    const size_t chunks = (r->splat_count + job.chunk_size - 1) / job.chunk_size;
+    const size_t chunks = (r->drawn_count + job.chunk_size - 1) / job.chunk_size;
     GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_begin, &r->tile_capacity, 0, tiles + 1, sizeof(size_t)));
     GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_counts, &r->count_capacity, 0, chunks * tiles, sizeof(uint32_t)));
     if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(uint32_t));
+    memset(r->splat_begin, 0, (r->splat_count + 1) * sizeof *r->splat_begin);
     gsf__parallel_for(ctx, chunks, gsf__bin_measure_chunk, &job);
     size_t spans = 0, total = 0;
     for (size_t c = 0; c < chunks; c++) {
@@ -8320,18 +8382,14 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     if (total > UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "rasterizer: %zu pairs of splats and tiles do not fit 32 bits", total);
     r->tile_begin[tiles] = total;
-    r->splat_begin[0] = 0;
     for (size_t i = 0; i < r->splat_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
-    r->pair_count = total;
-    if (total > r->pair_capacity || !r->splat_pairs) { // allocated even if empty: never NULL
+    r->entry_count = total;
+    if (total > r->entry_capacity || !r->splat_entries) { // allocated even if empty: never NULL
         const size_t capacity = total + total / 4;
-        r->pair_capacity = 0;
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_splat, capacity, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_keys, capacity, sizeof(uint64_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_spare, capacity, sizeof(uint64_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pairs, capacity, sizeof(gsf__pair)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_pairs, capacity, sizeof(uint32_t)));
-        r->pair_capacity = capacity;
+        r->entry_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->entries, capacity, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_entries, capacity, sizeof(uint32_t)));
+        r->entry_capacity = capacity;
     }
     gsf__parallel_for(ctx, chunks, gsf__bin_fill_chunk, &job);
     return GSF_OK;
@@ -8345,7 +8403,7 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
    final transmittance. `live` has a bit set for every step that has an open pixel. */
 typedef struct gsf__tile {
     const gsf__record* records; // per splat
-    const gsf__pair* pairs;     // the tile's list, front to back
+    const uint32_t* splats;     // the tile's list, front to back
     size_t count;
     float x0, y0;            // of the tile's first pixel
 } gsf__tile;
@@ -8460,7 +8518,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     uint32_t live = gsf__live_steps(state->T);
     float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const gsf__record* rec = tile->records + tile->splats[i];
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m), row = gsf__step_row(s, 0);
             int open = 0;
@@ -8508,9 +8566,9 @@ typedef struct gsf__batch {
 } gsf__batch;
 
 GSF__INLINE_AVX2 const gsf__record* gsf__batch_entry(const gsf__tile* tile, size_t i, size_t at, gsf__batch* batch) {
-    const gsf__record* rec = tile->records + tile->pairs[i].splat;
+    const gsf__record* rec = tile->records + tile->splats[i];
     if (i + 2 * GSF__AHEAD < tile->count)
-        _mm_prefetch((const char*)(tile->records + tile->pairs[i + 2 * GSF__AHEAD].splat), _MM_HINT_T0);
+        _mm_prefetch((const char*)(tile->records + tile->splats[i + 2 * GSF__AHEAD]), _MM_HINT_T0);
     batch->rec[at] = rec;
     batch->u[at] = rec->u - tile->x0 + rec->u_low;
     batch->v[at] = rec->v - tile->y0 + rec->v_low;
@@ -8883,7 +8941,7 @@ static void gsf__blend_simd128(const gsf__tile* tile, gsf__tile_state* state, in
     uint32_t live = gsf__live_simd128(state->T);
     float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const gsf__record* rec = tile->records + tile->splats[i];
         const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
         for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
             const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
@@ -8914,7 +8972,7 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const gsf__record* rec = tile->records + tile->splats[i];
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m);
             int open = 0, any = 0;
@@ -8948,7 +9006,7 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                                 uint8_t* slot_used, int flags) {
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__record* rec = tile->records + tile->splats[entry];
         const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         float sums[GSF__SLOT_FLOATS];
@@ -8984,9 +9042,8 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                 sums[GSF__SLOT_ABS_Y] += fabsf(p * (conic_b * e + conic_q * dy));
             }
         }
-        const size_t slot = tile->pairs[entry].slot;
-        memcpy(slots + GSF__SLOT_FLOATS * slot, sums, sizeof sums); // complete: an entry's steps are all in one bucket
-        slot_used[slot] = 1;
+        memcpy(slots + GSF__SLOT_FLOATS * entry, sums, sizeof sums); // complete: an entry's steps are all in one bucket
+        slot_used[entry] = 1;
     }
 }
 
@@ -9065,7 +9122,7 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__record* rec = tile->records + tile->splats[entry];
         const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
         const __m256 kx = _mm256_set1_ps(rec->kx);
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
@@ -9107,12 +9164,11 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
                 say = _mm256_add_ps(say, _mm256_and_ps(magnitude, dv));
             }
         }
-        const size_t slot = tile->pairs[entry].slot;
-        float* to = slots + GSF__SLOT_FLOATS * slot;
+        float* to = slots + GSF__SLOT_FLOATS * entry;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
         _mm256_storeu_ps(to, first); // complete: an entry's steps are all in one bucket
         _mm_storeu_ps(to + 8, gsf__sum4_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say));
-        slot_used[slot] = 1;
+        slot_used[entry] = 1;
     }
 }
 
@@ -9153,7 +9209,7 @@ GSF__INLINE_AVX512 void gsf__reverse_avx512_body(const gsf__tile* tile, const gs
     const gsf__wide_step* steps = (const gsf__wide_step*)(const void*)memory;
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__record* rec = tile->records + tile->splats[entry];
         const __m512 u = _mm512_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm512_set1_ps(rec->v - tile->y0 + rec->v_low);
         const __m512 kx = _mm512_set1_ps(rec->kx);
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
@@ -9196,10 +9252,9 @@ GSF__INLINE_AVX512 void gsf__reverse_avx512_body(const gsf__tile* tile, const gs
             }
         }
         const __m512 parts[12] = {sp, se, see, sy, sey, syy, sr, sg, sb, sz, _mm512_mul_ps(sax, _mm512_set1_ps(conic_a)), say};
-        const size_t slot = tile->pairs[entry].slot;
         // complete: an entry's steps are all in one bucket
-        _mm512_mask_storeu_ps(slots + GSF__SLOT_FLOATS * slot, 0x0fff, gsf__sum12_avx512(parts));
-        slot_used[slot] = 1;
+        _mm512_mask_storeu_ps(slots + GSF__SLOT_FLOATS * entry, 0x0fff, gsf__sum12_avx512(parts));
+        slot_used[entry] = 1;
     }
 }
 
@@ -9226,7 +9281,7 @@ static size_t gsf__keep_simd128(const gsf__tile* tile, float* T_tile, size_t fir
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        const gsf__record* rec = tile->records + tile->splats[i];
         const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
         for (uint32_t m = gsf__rows_simd128(rec, u, v, center, exponent) & live; m; m &= m - 1) {
             const uint32_t s = (uint32_t)gsf__lowest_bit(m), row = 2 * (s & 7);
@@ -9260,7 +9315,7 @@ GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const 
     const gsf__vf_simd128 alpha_max = gsf__v_set_simd128(GSF__ALPHA_MAX), zero = gsf__v_set_simd128(0.0f);
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
+        const gsf__record* rec = tile->records + tile->splats[entry];
         const gsf__vf_simd128 u = gsf__v_set_simd128(rec->u - tile->x0 + rec->u_low);
         const gsf__vf_simd128 v = gsf__v_set_simd128(rec->v - tile->y0 + rec->v_low), kx = gsf__v_set_simd128(rec->kx);
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
@@ -9308,13 +9363,12 @@ GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const 
                 }
             }
         }
-        const size_t slot = tile->pairs[entry].slot;
         sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] * gsf__v_set_simd128(conic_a);
         for (int i = 0; i < GSF__SLOT_FLOATS; i += 4) { // complete: an entry's steps are all in one bucket
             gsf__v_transpose_simd128(sum + i);
-            gsf__v_store_simd128(slots + GSF__SLOT_FLOATS * slot + i, (sum[i] + sum[i + 2]) + (sum[i + 1] + sum[i + 3]));
+            gsf__v_store_simd128(slots + GSF__SLOT_FLOATS * entry + i, (sum[i] + sum[i + 2]) + (sum[i + 1] + sum[i + 3]));
         }
-        slot_used[slot] = 1;
+        slot_used[entry] = 1;
     }
 }
 
@@ -9389,9 +9443,9 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
         for (size_t k = 0; k < 16 / WIDE; k++) sums[k] = gsf__vd_set(0.0);
         if (l < count && r->records[i + l].radius > 0) {
             for (size_t s = r->splat_begin[i + l]; s < r->splat_begin[i + l + 1]; s++) {
-                const size_t pair = r->splat_pairs[s];
-                if (!r->slot_used[pair]) continue;
-                const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
+                const size_t entry = r->splat_entries[s];
+                if (!r->slot_used[entry]) continue;
+                const float* slot = r->slots + GSF__SLOT_FLOATS * entry;
                 for (size_t k = 0; k < row / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
                 touched |= 1u << l;
             }
@@ -9406,7 +9460,7 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
 GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                              const gsf_splat_grads* grads, size_t i) {
     for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + GSF__LANES]; s++) {
-        const float* slot = r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s];
+        const float* slot = r->slots + GSF__SLOT_FLOATS * r->splat_entries[s];
         gsf__v_fetch(slot);
         gsf__v_fetch(slot + GSF__SLOT_FLOATS - 1);
     }
@@ -9635,6 +9689,9 @@ static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
         GSF__TRY(gsf__grow(ctx, (void**)&r->records, n, sizeof(gsf__record)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->radii, n, sizeof(int32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->splat_begin, n + 1, sizeof(size_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->order, n, sizeof(uint64_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->order_spare, n, sizeof(uint64_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->rows, n, sizeof(gsf__tile_span)));
         r->splat_capacity = n;
     }
     return GSF_OK;
@@ -9652,7 +9709,7 @@ typedef struct gsf__raster_job {
 static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
     gsf__tile tile;
     tile.records = r->records;
-    tile.pairs = r->pairs + r->tile_begin[index];
+    tile.splats = r->entries + r->tile_begin[index];
     tile.count = r->tile_begin[index + 1] - r->tile_begin[index];
     tile.x0 = (float)((int32_t)(index % (size_t)r->tiles_x) * GSF__TILE);
     tile.y0 = (float)((int32_t)(index / (size_t)r->tiles_x) * GSF__TILE);
@@ -9768,9 +9825,8 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     const gsf__view view = gsf__make_view(splats, camera, desc);
     gsf__splat_loop project = {r, &view, splats, desc->hidden, NULL, ctx->cpu_level};
     gsf__parallel_for(ctx, gsf__splat_chunks(r), gsf__project_chunk, &project);
+    GSF__TRY(gsf__order(ctx, r));
     GSF__TRY(gsf__bin(ctx, r, &view));
-    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
-    gsf__parallel_for(ctx, tiles, gsf__sort_tile, r);
 
     gsf__raster_job job;
     memset(&job, 0, sizeof job);
@@ -9779,7 +9835,7 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     job.view = &view;
     job.out = out;
     job.flags = r->has_depth ? GSF__WITH_DEPTH : 0;
-    gsf__parallel_for(ctx, tiles, gsf__blend_chunk, &job);
+    gsf__parallel_for(ctx, (size_t)r->tiles_x * (size_t)r->tiles_y, gsf__blend_chunk, &job);
     return GSF_OK;
 }
 
@@ -9885,8 +9941,8 @@ static gsf_result gsf__reserve_workers(gsf_context* ctx, gsf_rasterizer* r, size
 
 static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
-    if (r->pair_count > r->slot_capacity || !r->slots) {
-        const size_t capacity = r->pair_count + r->pair_count / 4;
+    if (r->entry_count > r->slot_capacity || !r->slots) {
+        const size_t capacity = r->entry_count + r->entry_count / 4;
         r->slot_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->slots, capacity, GSF__SLOT_FLOATS * sizeof(float)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->slot_used, capacity, 1));
@@ -9925,7 +9981,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     job.wants_background = grads->background != NULL;
     job.flags = (d_depth || d_alpha ? GSF__WITH_DEPTH : 0) | (view.official_gradient ? GSF__STRAIGHT_THROUGH : 0) |
                 (grads->means2d_abs ? GSF__WITH_ABS : 0);
-    if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
+    if (r->entry_count) memset(r->slot_used, 0, r->entry_count);
     gsf__parallel_for(ctx, tiles, gsf__reverse_chunk, &job);
     if (grads->background)
         for (int c = 0; c < 3; c++) {

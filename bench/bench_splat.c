@@ -211,15 +211,15 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
         clock.cpu_from = bench_cpu();
         gsf__parallel_for(&ctx, splat_chunks, gsf__project_chunk, &project);
         bench_lap(&clock, STAGE_PROJECT);
+        bench_require(&ctx, gsf__order(&ctx, r));
+        bench_lap(&clock, STAGE_SORT);
         bench_require(&ctx, gsf__bin(&ctx, r, &view));
         bench_lap(&clock, STAGE_BIN);
-        gsf__parallel_for(&ctx, tiles, gsf__sort_tile, r);
-        bench_lap(&clock, STAGE_SORT);
         gsf__parallel_for(&ctx, tiles, gsf__blend_chunk, &raster);
         bench_lap(&clock, STAGE_BLEND);
         bench_require(&ctx, gsf__loss(&ctx, &scratch, &target, (const float*)out.color.data, 0.2f, 1.0f, d_color, &value));
         bench_lap(&clock, STAGE_LOSS);
-        if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
+        if (r->entry_count) memset(r->slot_used, 0, r->entry_count);
         gsf__parallel_for(&ctx, tiles, gsf__reverse_chunk, &raster);
         bench_lap(&clock, STAGE_REVERSE);
         gsf__parallel_for(&ctx, splat_chunks, gsf__gather_chunk, &project);
@@ -242,11 +242,11 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     pairs = bench_pairs(&ctx, r);
 
     // minimum bytes that a stage transfers with cold caches: everything it reads and writes, once
-    const double n = (double)count, entries = (double)r->pair_count, p = (double)pixels;
+    const double n = (double)count, entries = (double)r->entry_count, p = (double)pixels;
     const double bytes[STAGES] = {
         n * (59 * 4 + sizeof(gsf__record) + 4),
         n * (2 * sizeof(gsf__record) + 8) + entries * (4 + 8),
-        entries * (4 + sizeof(gsf__record) + 8 * (2 + 2 * 4) + 8),
+        n * (sizeof(gsf__record) + 8 + 4 * 3 * 8), // four passes that read the keys twice and write them once
         entries * sizeof(gsf__record) + p * (3 + 1) * 4,
         p * 3 * 4 * 3,
         entries * (2 * sizeof(gsf__record) + GSF__SLOT_FLOATS * 4) + p * 4 * 4,
