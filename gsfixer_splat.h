@@ -718,7 +718,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_load_train_views(gsf_context* ctx, gs
 typedef enum gsf_initial_kind { // which points become splats
     GSF_INITIAL_AUTO = 0,  // RANDOM for a scene without points, BOTH for a single view, else DENSE
     GSF_INITIAL_BOTH,      // points of the scene that a view sees, by track or by ray
-    GSF_INITIAL_TRACKS,    // points whose track contains a view: the start used in the papers
+    GSF_INITIAL_TRACKS,    // points whose track contains a view: the start used in the papers; so few that it is better to
+                           // densify for 2/3 of the iterations (gsf_train_desc.densify_until), as `gsfix fix` does
     GSF_INITIAL_RAYS,      // points that a ray from a view reaches
     GSF_INITIAL_ALL,       // all points of the scene
     GSF_INITIAL_DENSE,     // BOTH, plus points of multi-view stereo between the views

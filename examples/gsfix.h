@@ -293,9 +293,9 @@ typedef struct gsfix_setup { // everything that determines a training
     gsf_fix_desc fix;
     gsf_initial_desc initial; // with its defaults filled in once the splats are made
 } gsfix_setup;
-// From the options; 0 or an exit code. Weights that depend on the number of photos are filled in by gsfix_settle_train.
+// From the options; 0 or an exit code. What depends on the number of photos or on the start is filled in by gsfix_settle_train.
 int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup);
-void gsfix_settle_train(gsf_train_desc* train, size_t view_count);
+void gsfix_settle_train(gsf_train_desc* train, gsf_initial_kind start, size_t view_count);
 // Fails, naming the member, if `now` (a JSON object) has a member that differs from that of `was`, or that `was` lacks.
 gsf_result gsfix_compare_settings(gsf_context* ctx, const char* name, const gsf_buffer* now, const gsf_json* old,
                                   const gsf_json_value* was);

@@ -359,7 +359,7 @@ static gsf_result start_trainer(scene_run* run, const gsfix_setup* setup, const 
     gsf_train_desc desc = setup->fix.train;
     gsf_initial_desc start = setup->initial;
     desc.render.near_plane = run->near_plane;
-    gsfix_settle_train(&desc, count);
+    gsfix_settle_train(&desc, start.kind, count);
     if (start.kind == GSF_INITIAL_ALL && !run->scene.point_count) start.kind = GSF_INITIAL_RANDOM;
     run->iteration = 0;
     gsf_result result = gsf_splat_load_train_views(ctx, &run->scene, views, count, &photos);

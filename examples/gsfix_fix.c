@@ -149,11 +149,14 @@ static int wants_also(const gsfix_app* app, int format) {
 static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
 #define BY_VIEWS (-1.0f) // no value of --set: what gsf_splat_resolve_few_view_desc takes for the number of photos
+#define BY_START (-2)    // no value of --set: longer for a start of few points, which have more to grow
 
-void gsfix_settle_train(gsf_train_desc* train, size_t view_count) {
+void gsfix_settle_train(gsf_train_desc* train, gsf_initial_kind start, size_t view_count) {
     const gsf_train_desc few = gsf_splat_resolve_few_view_desc(NULL, view_count, GSF_QUALITY_BALANCED).train;
     if (train->dropout == BY_VIEWS) train->dropout = few.dropout;
     if (train->opacity_decay == BY_VIEWS) train->opacity_decay = few.opacity_decay;
+    if (train->densify_until == BY_START)
+        train->densify_until = start == GSF_INITIAL_TRACKS && !train->mcmc ? 2 * train->iterations / 3 : 0;
 }
 
 int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
@@ -167,7 +170,8 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     if (app->o.iterations) train->iterations = app->o.iterations;
     train->seed = app->o.seed;
     const int regularized = !app->o.regularize || strcmp(app->o.regularize, "off") != 0;
-    if (!regularized)
+    if (regularized) train->densify_until = BY_START;
+    else
         train->dropout = train->opacity_decay = train->scale_penalty = train->opacity_penalty = train->depth_smoothness = 0.0f;
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     int code = apply_settings(app, setup);
@@ -888,7 +892,7 @@ static gsf_result prepare(fix_run* run) {
     if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
     if (result == GSF_OK && app->o.compare && !run->split.test_count)
         result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "--compare: the scene has no held-out view to compare on");
-    if (result == GSF_OK) gsfix_settle_train(&run->setup.fix.train, run->split.train_count);
+    if (result == GSF_OK) gsfix_settle_train(&run->setup.fix.train, run->setup.initial.kind, run->split.train_count);
     if (result == GSF_OK) result = open_fix_out(run); // before any expensive work
     if (result == GSF_OK) result = meet_checkpoint(run);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);

@@ -109,7 +109,7 @@ static gsf_result view_open_scene(viewer* v, const gsfix_setup* setup) {
                                                &v->splats, NULL);
     if (result == GSF_OK) result = orbit_set_pivot(ctx, &v->at, &v->splats, &radius);
     if (result != GSF_OK) return result;
-    gsfix_settle_train(&desc.train, v->split.train_count);
+    gsfix_settle_train(&desc.train, setup->initial.kind, v->split.train_count);
     desc.train.render.near_plane =
         gsf_splat_measure_near_plane(&v->scene.views[0].camera, sizeof v->scene.views[0], v->scene.view_count);
     v->desc = desc.train.render;
