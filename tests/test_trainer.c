@@ -1972,10 +1972,40 @@ static void test_sort(gsf_context* ctx) {
     gsf_splat_destroy(ctx, &s);
 }
 
+// The drawn splats in order of depth, those of the same depth in order of their index; one and several chunks.
+static void test_depth_order(gsf_context* ctx) {
+    static const size_t counts[] = {0, 1, 8192, 8193, 300000};
+    gsf_rasterizer* r;
+    CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &r));
+    r->width = r->height = 1;
+    uint64_t state = 12;
+    for (size_t c = 0; c < GSF__COUNT(counts); c++) {
+        size_t drawn = 0, wrong = 0;
+        r->splat_count = counts[c];
+        CHECK_OK(ctx, gsf__reserve_frame(ctx, r));
+        for (size_t i = 0; i < counts[c]; i++) {
+            const double x = test_random_in(&state, -60, 60);
+            r->records[i].depth = (float)exp2(i % 2 ? x : floor(x / 30)); // half of them are of four depths
+            r->records[i].radius = test_random_in(&state, 0, 1) < 0.7;
+            drawn += (size_t)r->records[i].radius;
+        }
+        CHECK_OK(ctx, gsf__order(ctx, r));
+        CHECK(r->drawn_count == drawn);
+        for (size_t k = 0; k < drawn; k++) {
+            const gsf__record* rec = r->records + (uint32_t)r->order[k];
+            wrong += rec->radius == 0 || (k > 0 && r->order[k] <= r->order[k - 1]);
+            wrong += k > 0 && rec->depth < r->records[(uint32_t)r->order[k - 1]].depth;
+        }
+        CHECK(wrong == 0);
+    }
+    gsf_splat_destroy_rasterizer(ctx, r);
+}
+
 int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
     test_sort(&ctx);
+    test_depth_order(&ctx);
     small_scene s = make_small_scene(&ctx);
     test_loss_derivative(&ctx);
     for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_SIMD128; level++) test_loss_accuracy((gsf_cpu_level)level);
