@@ -4999,7 +4999,7 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
     for (size_t i = first; i < job->tree->count && i < first + GSF__KNN_CHUNK; i++) {
         double distance2[3];
         size_t places[3];
-        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, INFINITY, 3, distance2, places);
+        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, (double)INFINITY, 3, distance2, places);
         double mean = 0.0;
         for (int k = 0; k < found; k++) mean += distance2[k];
         if (found) mean /= found;
@@ -5143,12 +5143,12 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     for (size_t i = first; i < tree->count && i < first + GSF__KNN_CHUNK; i++) {
         const double* p = tree->points + 3 * i;
         // The point before and its neighbours are as many others as are wanted, so that the farthest of them is a limit.
-        double beyond = found == wanted ? gsf__distance2(p, p - 3) : INFINITY;
+        double beyond = found == wanted ? gsf__distance2(p, p - 3) : (double)INFINITY;
         for (int k = 0; k < found; k++) {
             const double d = gsf__distance2(p, tree->points + 3 * places[k]);
             if (d > beyond) beyond = d;
         }
-        found = gsf__knn_query(tree, p, i, nextafter(beyond, INFINITY), wanted, distance2, places);
+        found = gsf__knn_query(tree, p, i, nextafter(beyond, (double)INFINITY), wanted, distance2, places);
         const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
         double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
         memset(cov, 0, sizeof cov);
