@@ -340,17 +340,17 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
     CHECK_OK(&ctx, gsf__vis_begin(&ctx, scene, views, count, &desc, keep, &job, &stats));
     for (size_t e = 0; e < count; e++) {
         gsf__vis_look(&ctx, &job, e);
-        const gsf__look* look = job.looks;
+        const gsf__look* seen_from = job.looks;
         for (size_t i = 0; i < job.discs.count; i++) {
             const size_t row = job.discs.rows[i];
             gsf__sight sight;
-            if (!gsf__vis_sight(&job, look->eye, i, &sight)) continue;
-            const double limit = (double)gsf__vis_limit(&job, look, i);
+            if (!gsf__vis_sight(&job, seen_from->eye, i, &sight)) continue;
+            const double limit = (double)gsf__vis_limit(&job, seen_from, i);
             double cover[3] = {0.0, 0.0, 0.0}; // outer two: with zero tolerance, rounding decides about discs in the plane
             for (int k = tolerance > 0.0f; k < 3 - (tolerance > 0.0f); k++) {
                 desc.tolerance = tolerance + close * (float)(k - 1);
                 for (size_t j = 0; j < job.discs.count; j++) {
-                    const gsf__vis_disc disc = gsf__vis_disc_of(&job, look->eye, j);
+                    const gsf__vis_disc disc = gsf__vis_disc_of(&job, seen_from->eye, j);
                     const double own = (double)job.discs.all[i].radius;
                     if (j != i) cover[k] += gsf__vis_cover(&disc, &sight, own, (double)desc.tolerance);
                 }
