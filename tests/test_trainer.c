@@ -1974,7 +1974,7 @@ static void test_sort(gsf_context* ctx) {
 
 // The drawn splats in order of depth, those of the same depth in order of their index; one and several chunks.
 static void test_depth_order(gsf_context* ctx) {
-    static const size_t counts[] = {0, 1, 8192, 8193, 300000};
+    static const size_t counts[] = {0, 1, 8192, 8193, 60000};
     gsf_rasterizer* r;
     CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &r));
     r->width = r->height = 1;
