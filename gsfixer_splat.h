@@ -4945,12 +4945,13 @@ static double gsf__knn_box_distance2(const double box[6], const double q[3]) {
 }
 
 // Finds the k points nearest to q (k <= GSF__KNN_MAX), nearest first: squared distances and positions in tree order.
-// The point at position `skip` is excluded (SIZE_MAX: none), and points are left out whose squared distance is `beyond` or
-// more. Returns the number found, which is less than k only if there are too few. Ties depend only on the tree.
-static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, double beyond, int k, double* distance2,
+// The point at position `skip` is excluded (SIZE_MAX: none). Returns the number found, which is less than k only if the
+// tree has too few points. Ties depend only on the tree.
+static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, int k, double* distance2,
                           size_t* places) {
     struct { size_t node; double distance2; uint32_t level; } stack[40];
     int depth = 0, found = 0;
+    double beyond = (double)INFINITY; // squared distance from which on no point is wanted
     if (tree->count == 0) return 0;
     stack[depth].node = 0;
     stack[depth].distance2 = 0.0;
@@ -4999,7 +5000,7 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
     for (size_t i = first; i < job->tree->count && i < first + GSF__KNN_CHUNK; i++) {
         double distance2[3];
         size_t places[3];
-        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, (double)INFINITY, 3, distance2, places);
+        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, 3, distance2, places);
         double mean = 0.0;
         for (int k = 0; k < found; k++) mean += distance2[k];
         if (found) mean /= found;
@@ -5137,18 +5138,11 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     const int wanted = job->desc->neighbours > job->desc->radius_neighbour ? job->desc->neighbours
                                                                           : job->desc->radius_neighbour;
     const size_t first = chunk * GSF__KNN_CHUNK;
-    double distance2[GSF__KNN_MAX];
-    size_t places[GSF__KNN_MAX];
-    int found = 0;
     for (size_t i = first; i < tree->count && i < first + GSF__KNN_CHUNK; i++) {
         const double* p = tree->points + 3 * i;
-        // The point before and its neighbours are as many others as are wanted, so that the farthest of them is a limit.
-        double beyond = found == wanted ? gsf__distance2(p, p - 3) : (double)INFINITY;
-        for (int k = 0; k < found; k++) {
-            const double d = gsf__distance2(p, tree->points + 3 * places[k]);
-            if (d > beyond) beyond = d;
-        }
-        found = gsf__knn_query(tree, p, i, nextafter(beyond, (double)INFINITY), wanted, distance2, places);
+        double distance2[GSF__KNN_MAX];
+        size_t places[GSF__KNN_MAX];
+        const int found = gsf__knn_query(tree, p, i, wanted, distance2, places);
         const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
         double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
         memset(cov, 0, sizeof cov);

@@ -51,7 +51,7 @@ static void check_neighbours(int kind, size_t count, int k) {
         double distance2[GSF__KNN_MAX];
         size_t places[GSF__KNN_MAX];
         const double* q = tree.points + 3 * i;
-        const int found = gsf__knn_query(&tree, q, i, (double)INFINITY, k, distance2, places);
+        const int found = gsf__knn_query(&tree, q, i, k, distance2, places);
         size_t n = 0;
         for (size_t j = 0; j < count; j++) {
             if (j == tree.rows[i]) continue;
@@ -98,7 +98,7 @@ static void test_neighbours(void) {
         for (size_t i = 0; i < many; i++) {
             double distance2[12];
             size_t places[12];
-            const int found = gsf__knn_query(&tree, tree.points + 3 * i, i, (double)INFINITY, 12, distance2, places);
+            const int found = gsf__knn_query(&tree, tree.points + 3 * i, i, 12, distance2, places);
             sum += found == 12 ? distance2[11] : NAN;
         }
         CHECK(isfinite(sum));
