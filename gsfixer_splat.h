@@ -7489,7 +7489,8 @@ enum {
     GSF__STRIP = 4,                      // columns of a strip
     GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 4 columns and 2 rows: splats are compact, so that this shape needs
                                          // fewer steps than 8 pixels of a row
-    GSF__AHEAD = 8,                      // list entries whose steps are found together
+    GSF__TOGETHER = 32,                  // list entries that are found together and blended step by step
+    GSF__AHEAD = 8,                      // the same by backward, which blends them one after the other
     GSF__PROJECT_CHUNK = 256,            // splats
     GSF__BUCKET = 4096,                  // steps that backward keeps at a time, plus the rest of the last entries
     GSF__KEPT_MOST = GSF__BUCKET + GSF__AHEAD * GSF__STEPS + 1,
@@ -8551,23 +8552,18 @@ GSF__LINES static const float gsf__rows_of[64] = {0,  1,  0,  1,  0,  1,  0,  1,
 
 #if GSF__X86
 
-// The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
-// compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
-typedef struct gsf__batch {
-    GSF__LINES float raw[GSF__AHEAD * GSF__TILE_PIXELS]; // of each item: alpha before the clamp, 0 where below 1/255
-    uint32_t items[GSF__AHEAD * GSF__STEPS + 16];     // entry << 8 | step, in the order of the list
-    float u[GSF__AHEAD], v[GSF__AHEAD];               // centres, relative to the tile
-    const gsf__record* rec[GSF__AHEAD];
-} gsf__batch;
+// List entries whose rows are found together, before any of them is blended.
+typedef struct gsf__entries {
+    GSF__LINES float center[GSF__TOGETHER][GSF__TILE]; // as in gsf__rows_scalar
+    float exponent[GSF__TOGETHER][GSF__TILE];
+    uint32_t overlaps[GSF__TOGETHER]; // a bit per step or block; none beyond the entries
+    const gsf__record* rec[GSF__TOGETHER];
+} gsf__entries;
 
-GSF__INLINE_AVX2 const gsf__record* gsf__batch_entry(const gsf__tile* tile, size_t i, size_t at, gsf__batch* batch) {
-    const gsf__record* rec = tile->records + tile->splats[i];
-    if (i + 2 * GSF__AHEAD < tile->count)
-        _mm_prefetch((const char*)(tile->records + tile->splats[i + 2 * GSF__AHEAD]), _MM_HINT_T0);
-    batch->rec[at] = rec;
-    batch->u[at] = rec->u - tile->x0 + rec->u_low;
-    batch->v[at] = rec->v - tile->y0 + rec->v_low;
-    return rec;
+GSF__INLINE_AVX2 const gsf__record* gsf__entry(const gsf__tile* tile, size_t i) {
+    enum { FETCHED = 16 };
+    if (i + FETCHED < tile->count) _mm_prefetch((const char*)(tile->records + tile->splats[i + FETCHED]), _MM_HINT_T0);
+    return tile->records + tile->splats[i];
 }
 
 // Bits of the pairs of rows whose interval from..to overlaps the strip that begins at column `first`.
@@ -8579,8 +8575,9 @@ GSF__INLINE_AVX2 uint32_t gsf__strip_avx2(__m256 from, __m256 to, float first) {
 }
 
 // Like gsf__rows_scalar, 8 rows at a time.
-GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float v, float center[GSF__TILE],
+GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__tile* tile, const gsf__record* rec, float center[GSF__TILE],
                                          float exponent[GSF__TILE]) {
+    const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
     const __m256 kx = _mm256_set1_ps(rec->kx), yy = _mm256_set1_ps(rec->yy), lo = _mm256_set1_ps(rec->log2_opacity);
     const __m256 h0 = _mm256_set1_ps(rec->h0), h1 = _mm256_set1_ps(rec->h1), zero = _mm256_setzero_ps();
     __m256 left[2], right[2];
@@ -8589,8 +8586,8 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float 
         const __m256 dy = _mm256_sub_ps(row, _mm256_set1_ps(v));
         const __m256 half2 = _mm256_fnmadd_ps(_mm256_mul_ps(h1, dy), dy, h0);
         const __m256 c = _mm256_fmadd_ps(kx, dy, _mm256_set1_ps(u));
-        _mm256_storeu_ps(center + 8 * k, c);
-        _mm256_storeu_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
+        _mm256_store_ps(center + 8 * k, c);
+        _mm256_store_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
         const __m256 wide = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
         const __m256 half = _mm256_blendv_ps(_mm256_set1_ps(-1e30f), wide, _mm256_cmp_ps(half2, zero, _CMP_GE_OQ));
         left[k] = _mm256_sub_ps(c, half);
@@ -8605,7 +8602,19 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, float u, float 
            gsf__strip_avx2(from, to, 8.0f) << 16 | gsf__strip_avx2(from, to, 12.0f) << 24;
 }
 
+// The list entries from `first` to `end`.
+GSF__INLINE_AVX2 void gsf__find_avx2(const gsf__tile* tile, size_t first, size_t end, gsf__entries* entries) {
+    size_t at = 0;
+    for (size_t i = first; i < end; i++, at++) {
+        entries->rec[at] = gsf__entry(tile, i);
+        entries->overlaps[at] = gsf__rows_avx2(tile, entries->rec[at], entries->center[at], entries->exponent[at]);
+    }
+    while (at < GSF__TOGETHER) entries->overlaps[at++] = 0;
+}
+
+// 2^x where that is at least 1/255, else 0.
 GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
+    const __m256 seen = _mm256_cmp_ps(x, _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
     const __m256 rounder = _mm256_set1_ps(12582912.0f); // leaves the nearest integer, ties to even, in the low bits
     const __m256 rounded = _mm256_add_ps(x, rounder), f = _mm256_sub_ps(x, _mm256_sub_ps(rounded, rounder));
     __m256 p = _mm256_set1_ps(1.3276404e-3f);
@@ -8615,43 +8624,16 @@ GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.69314694f));
     p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(1.0000001f));
     const __m256i shift = _mm256_slli_epi32(_mm256_castps_si256(rounded), 23);
-    return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
+    return _mm256_and_ps(seen, _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift)));
 }
 
-// Lists the steps of the entries from `first` to `end` that are in `live`; returns their number.
-GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, size_t end, uint32_t live, gsf__batch* batch) {
-    GSF__LINES float center[GSF__AHEAD][GSF__TILE];
-    GSF__LINES float exponent[GSF__AHEAD][GSF__TILE];
-    uint32_t masks[GSF__AHEAD];
-    size_t count = 0;
-    for (size_t i = first, at = 0; i < end; i++, at++) {
-        const gsf__record* rec = gsf__batch_entry(tile, i, at, batch);
-        masks[at] = gsf__rows_avx2(rec, batch->u[at], batch->v[at], center[at], exponent[at]) & live;
-    }
-    for (size_t at = 0; at < end - first; at++) {
-        const __m256 ee = _mm256_set1_ps(batch->rec[at]->ee);
-        for (uint32_t m = masks[at]; m; m &= m - 1, count++) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            const double* centers = (const double*)(const void*)(center[at] + 2 * (s & 7)); // of two rows
-            const double* exponents = (const double*)(const void*)(exponent[at] + 2 * (s & 7));
-            const __m256 c = _mm256_castpd_ps(_mm256_broadcast_sd(centers));
-            const __m256 e = _mm256_sub_ps(_mm256_load_ps(gsf__columns_of + 16 * (s >> 3)), c);
-            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_castpd_ps(_mm256_broadcast_sd(exponents)));
-            const __m256 seen = _mm256_cmp_ps(x, _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
-            batch->items[count] = (uint32_t)at << 8 | s;
-            _mm256_storeu_ps(batch->raw + 8 * count, _mm256_and_ps(seen, gsf__exp2_avx2(x)));
-        }
-    }
-    return count;
-}
-
-// Blends alphas (after the clamp) into T. Finished pixels keep theirs, which is negative. *shown: where the splat is
-// blended. Without branches, because it is hard to predict when a pixel finishes.
-GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 T, __m256 alpha, __m256* weight, __m256* shown) {
-    const __m256 open = _mm256_max_ps(T, _mm256_setzero_ps()), next = _mm256_fnmadd_ps(open, alpha, T);
-    *shown = _mm256_cmp_ps(next, _mm256_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    *weight = _mm256_and_ps(*shown, _mm256_mul_ps(open, alpha));
-    return _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, *shown);
+// Alphas of an entry before the clamp, in the step of these columns and of two rows from `row` on.
+GSF__INLINE_AVX2 __m256 gsf__alpha_avx2(const gsf__entries* entries, size_t at, __m256 columns, size_t row) {
+    const double* centers = (const double*)(const void*)(entries->center[at] + row);
+    const double* exponents = (const double*)(const void*)(entries->exponent[at] + row);
+    const __m256 e = _mm256_sub_ps(columns, _mm256_castpd_ps(_mm256_broadcast_sd(centers)));
+    const __m256 ee = _mm256_mul_ps(_mm256_set1_ps(entries->rec[at]->ee), e);
+    return gsf__exp2_avx2(_mm256_fmadd_ps(ee, e, _mm256_castpd_ps(_mm256_broadcast_sd(exponents))));
 }
 
 GSF__INLINE_AVX2 uint32_t gsf__live_avx2(const float* T) {
@@ -8668,24 +8650,58 @@ GSF__INLINE_AVX2 uint32_t gsf__live_avx2(const float* T) {
     return live;
 }
 
+// The entries that overlap step s.
+GSF__INLINE_AVX2 uint32_t gsf__entries_of_avx2(const gsf__entries* entries, uint32_t s) {
+    uint32_t found = 0;
+    for (int k = 0; k < GSF__TOGETHER; k += 8) { // the bit becomes the sign
+        const __m256i overlaps = _mm256_loadu_si256((const __m256i*)(const void*)(entries->overlaps + k));
+        const __m256i signs = _mm256_sll_epi32(overlaps, _mm_cvtsi32_si128((int)(GSF__STEPS - 1 - s)));
+        found |= (uint32_t)_mm256_movemask_ps(_mm256_castsi256_ps(signs)) << k;
+    }
+    return found;
+}
+
+// Entries are found together; then each step blends those that overlap it while its pixels are in registers. T goes on
+// falling where a pixel is finished, so that no blend waits for the comparison of the one before.
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
-    gsf__batch batch;
+    gsf__entries entries;
+    const __m256 least = _mm256_set1_ps(GSF__T_MIN);
     uint32_t live = gsf__live_avx2(state->T);
-    for (size_t i = 0, end; i < tile->count && live; i = end, live = gsf__live_avx2(state->T)) {
-        end = i + GSF__AHEAD < tile->count ? i + GSF__AHEAD : tile->count;
-        const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
-        for (size_t k = 0; k < count; k++) {
-            const size_t at = 8 * (batch.items[k] & 255u);
-            const gsf__record* rec = batch.rec[batch.items[k] >> 8];
-            const __m256 alpha = _mm256_min_ps(_mm256_loadu_ps(batch.raw + 8 * k), _mm256_set1_ps(GSF__ALPHA_MAX));
-            __m256 w, shown;
-            _mm256_storeu_ps(state->T + at, gsf__next_avx2(_mm256_loadu_ps(state->T + at), alpha, &w, &shown));
-            _mm256_storeu_ps(state->r + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->r), _mm256_loadu_ps(state->r + at)));
-            _mm256_storeu_ps(state->g + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->g), _mm256_loadu_ps(state->g + at)));
-            _mm256_storeu_ps(state->b + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->b), _mm256_loadu_ps(state->b + at)));
-            if (with_depth)
-                _mm256_storeu_ps(state->z + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
-                                                                _mm256_loadu_ps(state->z + at)));
+    for (size_t i = 0, end; i < tile->count && live; i = end) {
+        end = i + GSF__TOGETHER < tile->count ? i + GSF__TOGETHER : tile->count;
+        gsf__find_avx2(tile, i, end, &entries);
+        for (uint32_t m = live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
+            uint32_t left = gsf__entries_of_avx2(&entries, s);
+            if (!left) continue;
+            float *r = state->r + 8 * s, *g = state->g + 8 * s, *b = state->b + 8 * s, *z = state->z + 8 * s;
+            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
+            __m256 last = _mm256_load_ps(state->T + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps());
+            __m256 red = _mm256_load_ps(r), green = _mm256_load_ps(g), blue = _mm256_load_ps(b), depth = _mm256_load_ps(z);
+            __m256 shown;
+            do {
+                const size_t at = (size_t)gsf__lowest_bit(left);
+                const gsf__record* rec = entries.rec[at];
+                const __m256 raw = gsf__alpha_avx2(&entries, at, columns, 2 * (s & 7));
+                const __m256 alpha = _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX));
+                const __m256 next = _mm256_fnmadd_ps(T, alpha, T);
+                shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
+                const __m256 w = _mm256_and_ps(shown, _mm256_mul_ps(T, alpha));
+                last = _mm256_blendv_ps(last, next, shown);
+                red = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->r), red);
+                green = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->g), green);
+                blue = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->b), blue);
+                if (with_depth) depth = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth), depth);
+                T = next;
+                left &= left - 1;
+            } while (left);
+            if (!_mm256_movemask_ps(shown)) live &= ~(1u << s);
+            const __m256 finished = _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f));
+            _mm256_store_ps(state->T + 8 * s, _mm256_or_ps(last, finished));
+            _mm256_store_ps(r, red);
+            _mm256_store_ps(g, green);
+            _mm256_store_ps(b, blue);
+            if (with_depth) _mm256_store_ps(z, depth);
         }
     }
 }
@@ -8697,13 +8713,18 @@ GSF__TARGET_AVX2 static void gsf__blend_avx2(const gsf__tile* tile, gsf__tile_st
 
 enum { GSF__BLOCKS = GSF__TILE_PIXELS / 16 }; // block b: 4 x 4 pixels from index 16 b on, strip b >> 2
 
-// A bit per block that the ellipse overlaps, in the order of the rows: bit 4 * (row / 4) + strip.
-GSF__INLINE_AVX512 uint32_t gsf__blocks_avx512(const gsf__record* rec, float u, float v) {
+// As gsf__rows_avx2. A bit per block that the ellipse overlaps, in the order of the rows: bit 4 * (row / 4) + strip.
+GSF__INLINE_AVX512 uint32_t gsf__rows_avx512(const gsf__tile* tile, const gsf__record* rec, float center[GSF__TILE],
+                                             float exponent[GSF__TILE]) {
+    const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
     const __m512 row = _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), zero = _mm512_setzero_ps();
     const __m512 first = _mm512_setr_ps(0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12);
     const __m512 dy = _mm512_sub_ps(row, _mm512_set1_ps(v));
     const __m512 half2 = _mm512_fnmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->h1), dy), dy, _mm512_set1_ps(rec->h0));
     const __m512 c = _mm512_fmadd_ps(_mm512_set1_ps(rec->kx), dy, _mm512_set1_ps(u));
+    const __m512 yy = _mm512_mul_ps(_mm512_set1_ps(rec->yy), dy);
+    _mm512_store_ps(center, c);
+    _mm512_store_ps(exponent, _mm512_fmadd_ps(yy, dy, _mm512_set1_ps(rec->log2_opacity)));
     const __m512 wide = _mm512_add_ps(_mm512_sqrt_ps(_mm512_max_ps(half2, zero)), _mm512_set1_ps(0.02f));
     const __m512 half = _mm512_mask_blend_ps(_mm512_cmp_ps_mask(half2, zero, _CMP_GE_OQ), _mm512_set1_ps(-1e30f), wide);
     __m512 from = _mm512_sub_ps(c, half), to = _mm512_add_ps(c, half); // then the union over the rows of a block
@@ -8715,12 +8736,22 @@ GSF__INLINE_AVX512 uint32_t gsf__blocks_avx512(const gsf__record* rec, float u, 
     return _mm512_mask_cmp_ps_mask(starts, to, first, _CMP_GE_OQ);
 }
 
-GSF__INLINE_AVX512 __m512 gsf__alpha_avx512(const gsf__record* rec, float u, float v, size_t b) {
-    const __m512 dy = _mm512_sub_ps(_mm512_loadu_ps(gsf__rows_of + 16 * (b & 3)), _mm512_set1_ps(v));
-    const __m512 center = _mm512_fmadd_ps(_mm512_set1_ps(rec->kx), dy, _mm512_set1_ps(u));
-    const __m512 e = _mm512_sub_ps(_mm512_loadu_ps(gsf__columns_of + 16 * (b >> 2)), center);
-    const __m512 exponent = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->yy), dy), dy, _mm512_set1_ps(rec->log2_opacity));
-    const __m512 x = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->ee), e), e, exponent);
+GSF__INLINE_AVX512 void gsf__find_avx512(const gsf__tile* tile, size_t first, size_t end, gsf__entries* entries) {
+    size_t at = 0;
+    for (size_t i = first; i < end; i++, at++) {
+        entries->rec[at] = gsf__entry(tile, i);
+        entries->overlaps[at] = gsf__rows_avx512(tile, entries->rec[at], entries->center[at], entries->exponent[at]);
+    }
+    while (at < GSF__TOGETHER) entries->overlaps[at++] = 0;
+}
+
+// As gsf__alpha_avx2, in a block of these columns and of four rows from `row` on.
+GSF__INLINE_AVX512 __m512 gsf__alpha_avx512(const gsf__entries* entries, size_t at, __m512 columns, size_t row) {
+    const __m512i spread = _mm512_setr_epi32(0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3);
+    const __m512 center = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_load_ps(entries->center[at] + row)), spread);
+    const __m512 exponent = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_load_ps(entries->exponent[at] + row)), spread);
+    const __m512 e = _mm512_sub_ps(columns, center);
+    const __m512 x = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(entries->rec[at]->ee), e), e, exponent);
     const __mmask16 seen = _mm512_cmp_ps_mask(x, _mm512_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
     const __m512 k = gsf__v_round_avx512(x), f = _mm512_sub_ps(x, k);
     __m512 p = _mm512_set1_ps(1.3276404e-3f); // as in gsf__exp2_avx2
@@ -8732,36 +8763,7 @@ GSF__INLINE_AVX512 __m512 gsf__alpha_avx512(const gsf__record* rec, float u, flo
     return gsf__v_keep_avx512(seen, gsf__v_scale2_avx512(p, k));
 }
 
-// Like gsf__batch_avx2, for blocks; bits of `live` are in the order of gsf__blocks_avx512.
-GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first, size_t end, uint32_t live,
-                                            gsf__batch* batch) {
-    const __m512i blocks = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-    size_t count = 0;
-    for (size_t i = first; i < end; i++) {
-        const size_t at = i - first;
-        const gsf__record* rec = gsf__batch_entry(tile, i, at, batch);
-        const uint32_t mask = gsf__blocks_avx512(rec, batch->u[at], batch->v[at]) & live;
-        const __m512i items = _mm512_or_si512(blocks, _mm512_set1_epi32((int)at << 8));
-        _mm512_storeu_si512(batch->items + count, _mm512_maskz_compress_epi32((__mmask16)mask, items));
-        count += (size_t)__builtin_popcount(mask);
-    }
-    for (size_t k = 0; k < count; k++) {
-        const size_t at = batch->items[k] >> 8;
-        _mm512_storeu_ps(batch->raw + 16 * k,
-                         gsf__alpha_avx512(batch->rec[at], batch->u[at], batch->v[at], batch->items[k] & 255u));
-    }
-    return count;
-}
-
-// As gsf__next_avx2.
-GSF__INLINE_AVX512 __m512 gsf__next_avx512(__m512 T, __m512 alpha, __m512* weight, __mmask16* shown) {
-    const __m512 open = _mm512_max_ps(T, _mm512_setzero_ps()), next = _mm512_fnmadd_ps(open, alpha, T);
-    *shown = _mm512_cmp_ps_mask(next, _mm512_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    *weight = _mm512_maskz_mul_ps(*shown, open, alpha);
-    return _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), *shown, next);
-}
-
-GSF__INLINE_AVX512 uint32_t gsf__live_avx512(const float* T) {
+GSF__INLINE_AVX512 uint32_t gsf__live_avx512(const float* T) { // bits as in gsf__rows_avx512
     uint32_t live = 0;
     for (uint32_t b = 0; b < GSF__BLOCKS; b++) {
         const __mmask16 open = _mm512_cmp_ps_mask(_mm512_loadu_ps(T + 16 * b), _mm512_setzero_ps(), _CMP_GT_OQ);
@@ -8772,24 +8774,47 @@ GSF__INLINE_AVX512 uint32_t gsf__live_avx512(const float* T) {
 
 // As gsf__blend_avx2_body, with a block in place of a step.
 GSF__INLINE_AVX512 void gsf__blend_avx512_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
-    gsf__batch batch;
+    gsf__entries entries;
+    const __m512 least = _mm512_set1_ps(GSF__T_MIN);
     uint32_t live = gsf__live_avx512(state->T);
-    for (size_t i = 0, end; i < tile->count && live; i = end, live = gsf__live_avx512(state->T)) {
-        end = i + GSF__AHEAD < tile->count ? i + GSF__AHEAD : tile->count;
-        const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
-        for (size_t k = 0; k < count; k++) {
-            const size_t at = 16 * (batch.items[k] & 255u);
-            const gsf__record* rec = batch.rec[batch.items[k] >> 8];
-            const __m512 alpha = _mm512_min_ps(_mm512_loadu_ps(batch.raw + 16 * k), _mm512_set1_ps(GSF__ALPHA_MAX));
-            __m512 w;
+    for (size_t i = 0, end; i < tile->count && live; i = end) {
+        end = i + GSF__TOGETHER < tile->count ? i + GSF__TOGETHER : tile->count;
+        gsf__find_avx512(tile, i, end, &entries);
+        const __m512i overlaps = _mm512_loadu_si512(entries.overlaps), more = _mm512_loadu_si512(entries.overlaps + 16);
+        for (uint32_t m = live; m; m &= m - 1) {
+            const uint32_t number = (uint32_t)gsf__lowest_bit(m), block = (number & 3) << 2 | number >> 2;
+            const __m512i bit = _mm512_set1_epi32((int)(1u << number));
+            uint32_t left = (uint32_t)_mm512_test_epi32_mask(overlaps, bit) |
+                            (uint32_t)_mm512_test_epi32_mask(more, bit) << 16;
+            if (!left) continue;
+            float *r = state->r + 16 * block, *g = state->g + 16 * block, *b = state->b + 16 * block;
+            float* z = state->z + 16 * block;
+            const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
+            __m512 last = _mm512_load_ps(state->T + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
+            __m512 red = _mm512_load_ps(r), green = _mm512_load_ps(g), blue = _mm512_load_ps(b), depth = _mm512_load_ps(z);
             __mmask16 shown;
-            _mm512_storeu_ps(state->T + at, gsf__next_avx512(_mm512_loadu_ps(state->T + at), alpha, &w, &shown));
-            _mm512_storeu_ps(state->r + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->r), _mm512_loadu_ps(state->r + at)));
-            _mm512_storeu_ps(state->g + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->g), _mm512_loadu_ps(state->g + at)));
-            _mm512_storeu_ps(state->b + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->b), _mm512_loadu_ps(state->b + at)));
-            if (with_depth)
-                _mm512_storeu_ps(state->z + at, _mm512_fmadd_ps(w, _mm512_set1_ps(rec->depth),
-                                                                _mm512_loadu_ps(state->z + at)));
+            do {
+                const size_t at = (size_t)gsf__lowest_bit(left);
+                const gsf__record* rec = entries.rec[at];
+                const __m512 raw = gsf__alpha_avx512(&entries, at, columns, 4 * (block & 3));
+                const __m512 alpha = _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX));
+                const __m512 next = _mm512_fnmadd_ps(T, alpha, T);
+                shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
+                const __m512 w = _mm512_maskz_mul_ps(shown, T, alpha);
+                last = _mm512_mask_mov_ps(last, shown, next);
+                red = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->r), red);
+                green = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->g), green);
+                blue = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->b), blue);
+                if (with_depth) depth = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->depth), depth);
+                T = next;
+                left &= left - 1;
+            } while (left);
+            if (!shown) live &= ~(1u << number);
+            _mm512_store_ps(state->T + 16 * block, _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f)));
+            _mm512_store_ps(r, red);
+            _mm512_store_ps(g, green);
+            _mm512_store_ps(b, blue);
+            if (with_depth) _mm512_store_ps(z, depth);
         }
     }
 }
@@ -9044,52 +9069,108 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
 
 #if GSF__X86
 
-GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
-                                              gsf__step* steps, gsf__step_head* heads, size_t* step_count) {
+// The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
+// compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
+typedef struct gsf__batch {
+    GSF__LINES float raw[GSF__AHEAD * GSF__TILE_PIXELS]; // of each item: alpha before the clamp, 0 where below 1/255
+    uint32_t items[GSF__AHEAD * GSF__STEPS + 16];     // entry << 8 | step, in the order of the list
+    gsf__entries entries;
+} gsf__batch;
+
+// Lists the steps of the entries from `first` to `end` that are in `live`; returns their number.
+GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, size_t end, uint32_t live, gsf__batch* batch) {
+    size_t count = 0;
+    gsf__find_avx2(tile, first, end, &batch->entries);
+    for (size_t at = 0; at < end - first; at++)
+        for (uint32_t m = batch->entries.overlaps[at] & live; m; m &= m - 1, count++) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
+            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
+            batch->items[count] = (uint32_t)at << 8 | s;
+            _mm256_store_ps(batch->raw + 8 * count, gsf__alpha_avx2(&batch->entries, at, columns, 2 * (s & 7)));
+        }
+    return count;
+}
+
+// Blends alphas (after the clamp) into T. Finished pixels keep theirs, which is negative. Returns where the splat is
+// blended. Without branches, because it is hard to predict when a pixel finishes.
+GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 alpha, float* memory) {
+    const __m256 T = _mm256_load_ps(memory), open = _mm256_max_ps(T, _mm256_setzero_ps());
+    const __m256 next = _mm256_fnmadd_ps(open, alpha, T), shown = _mm256_cmp_ps(next, _mm256_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
+    _mm256_store_ps(memory, _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, shown));
+    return shown;
+}
+
+GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps,
+                                              gsf__step_head* heads, size_t* step_count) {
     gsf__batch batch;
-    uint32_t live = gsf__live_avx2(T_tile);
+    uint32_t live = gsf__live_avx2(T);
     size_t kept = 0, i = first;
-    for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end, live = gsf__live_avx2(T_tile)) {
+    for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end, live = gsf__live_avx2(T)) {
         end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
         const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
         for (size_t k = 0; k < count; k++) {
             const uint32_t s = batch.items[k] & 255u;
-            const __m256 T = _mm256_loadu_ps(T_tile + 8 * s), raw = _mm256_loadu_ps(batch.raw + 8 * k);
-            __m256 weight, shown;
-            _mm256_storeu_ps(T_tile + 8 * s,
-                             gsf__next_avx2(T, _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), &weight, &shown));
-            const __m256 kept_alpha = _mm256_and_ps(shown, raw);
-            _mm256_storeu_ps(steps[kept].alpha, kept_alpha);
-            _mm256_storeu_ps(steps[kept].T, T);
+            const __m256 raw = _mm256_load_ps(batch.raw + 8 * k);
+            _mm256_storeu_ps(steps[kept].T, _mm256_load_ps(T + 8 * s));
+            const __m256 shown = gsf__next_avx2(_mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T + 8 * s);
+            const __m256 alpha = _mm256_and_ps(shown, raw);
+            _mm256_storeu_ps(steps[kept].alpha, alpha);
             heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
             heads[kept].step = s;
-            kept += !_mm256_testz_si256(_mm256_castps_si256(kept_alpha), _mm256_castps_si256(kept_alpha));
+            kept += !_mm256_testz_si256(_mm256_castps_si256(alpha), _mm256_castps_si256(alpha));
         }
     }
     *step_count = kept;
     return live && i < last ? i : tile->count;
 }
 
-GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
+// Like gsf__batch_avx2, for blocks; bits of `live` are those of gsf__rows_avx512.
+GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first, size_t end, uint32_t live,
+                                            gsf__batch* batch) {
+    const __m512i blocks = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+    size_t count = 0;
+    gsf__find_avx512(tile, first, end, &batch->entries);
+    for (size_t at = 0; at < end - first; at++) {
+        const uint32_t mask = batch->entries.overlaps[at] & live;
+        const __m512i items = _mm512_or_si512(blocks, _mm512_set1_epi32((int)at << 8));
+        _mm512_storeu_si512(batch->items + count, _mm512_maskz_compress_epi32((__mmask16)mask, items));
+        count += (size_t)__builtin_popcount(mask);
+    }
+    for (size_t k = 0; k < count; k++) {
+        const size_t block = batch->items[k] & 255u;
+        const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
+        _mm512_store_ps(batch->raw + 16 * k,
+                        gsf__alpha_avx512(&batch->entries, batch->items[k] >> 8, columns, 4 * (block & 3)));
+    }
+    return count;
+}
+
+// As gsf__next_avx2.
+GSF__INLINE_AVX512 __mmask16 gsf__next_avx512(__m512 alpha, float* memory) {
+    const __m512 T = _mm512_load_ps(memory), open = _mm512_max_ps(T, _mm512_setzero_ps());
+    const __m512 next = _mm512_fnmadd_ps(open, alpha, T);
+    const __mmask16 shown = _mm512_cmp_ps_mask(next, _mm512_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
+    _mm512_store_ps(memory, _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), shown, next));
+    return shown;
+}
+
+GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T, size_t first, size_t last,
                                                   gsf__step* memory, gsf__step_head* heads, size_t* step_count) {
     gsf__wide_step* steps = (gsf__wide_step*)(void*)memory;
     gsf__batch batch;
-    uint32_t live = gsf__live_avx512(T_tile);
+    uint32_t live = gsf__live_avx512(T);
     size_t kept = 0, i = first;
-    for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end, live = gsf__live_avx512(T_tile)) {
+    for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end, live = gsf__live_avx512(T)) {
         end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
         const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
         for (size_t k = 0; k < count; k++) {
-            const uint32_t b = batch.items[k] & 255u;
-            const __m512 T = _mm512_loadu_ps(T_tile + 16 * b), raw = _mm512_loadu_ps(batch.raw + 16 * k);
-            __m512 weight;
-            __mmask16 shown;
-            _mm512_storeu_ps(T_tile + 16 * b,
-                             gsf__next_avx512(T, _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), &weight, &shown));
+            const uint32_t block = batch.items[k] & 255u;
+            const __m512 raw = _mm512_load_ps(batch.raw + 16 * k);
+            _mm512_storeu_ps(steps[kept].T, _mm512_load_ps(T + 16 * block));
+            const __mmask16 shown = gsf__next_avx512(_mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T + 16 * block);
             _mm512_storeu_ps(steps[kept].alpha, _mm512_maskz_mov_ps(shown, raw));
-            _mm512_storeu_ps(steps[kept].T, T);
             heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
-            heads[kept].step = b;
+            heads[kept].step = block;
             kept += _mm512_mask_cmp_ps_mask(shown, raw, _mm512_setzero_ps(), _CMP_GT_OQ) != 0;
         }
     }
@@ -9750,12 +9831,15 @@ static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int ch
 
 // The colours of a tile's row over the background, and their T.
 static inline void gsf__row_colors(const gsf__tile_state* state, int row, const float background[3], float* rgb, float* T) {
-    for (int x = 0; x < GSF__TILE; x++) {
-        const int k = gsf__tile_pixel(x, row);
-        T[x] = fabsf(state->T[k]);
-        rgb[3 * x] = state->r[k] + T[x] * background[0];
-        rgb[3 * x + 1] = state->g[k] + T[x] * background[1];
-        rgb[3 * x + 2] = state->b[k] + T[x] * background[2];
+    for (int strip = 0; strip < GSF__TILE / GSF__STRIP; strip++) {
+        const int from = gsf__tile_pixel(GSF__STRIP * strip, row);
+        for (int k = from; k < from + 2 * GSF__STRIP; k += 2, T++, rgb += 3) {
+            const float behind = fabsf(state->T[k]);
+            *T = behind;
+            rgb[0] = state->r[k] + behind * background[0];
+            rgb[1] = state->g[k] + behind * background[1];
+            rgb[2] = state->b[k] + behind * background[2];
+        }
     }
 }
 
@@ -9782,12 +9866,13 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     for (int row = 0; row < rows; row++) {
         const int64_t x0 = (int64_t)tile.x0, y = (int64_t)tile.y0 + row;
         const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x0;
-        float rgb[3 * GSF__TILE], T[GSF__TILE];
-        gsf__row_colors(&state, row, job->view->background, rgb, T);
-        if (columns == GSF__TILE && packed && color->data) { // most rows: copies of constant length
-            memcpy(r->final_T + pixel, T, sizeof T);
-            memcpy((char*)color->data + y * color->stride_y + x0 * color->stride_x, rgb, sizeof rgb);
+        float rgb[3 * GSF__TILE], T_row[GSF__TILE], *T = T_row;
+        if (columns == GSF__TILE && packed && color->data) { // most rows
+            T = r->final_T + pixel;
+            gsf__row_colors(&state, row, job->view->background,
+                            (float*)(void*)((char*)color->data + y * color->stride_y + x0 * color->stride_x), T);
         } else {
+            gsf__row_colors(&state, row, job->view->background, rgb, T);
             memcpy(r->final_T + pixel, T, (size_t)columns * sizeof(float));
             for (int k = 0; k < 3 * columns && color->data; k++) gsf__put_pixel(color, x0 + k / 3, y, k % 3, rgb[k]);
         }

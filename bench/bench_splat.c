@@ -750,6 +750,7 @@ int main(int argc, char** argv) {
             bench_stages(&o, "10k 264x480", 10000, 0.03, 264, 480, levels[k], threads);
             if (o.quick) continue;
             bench_stages(&o, "100k 960x540", 100000, 0.012, 960, 540, levels[k], threads);
+            bench_stages(&o, "100k 1280x720", 100000, 0.012, 1280, 720, levels[k], threads);
             if (levels[k] > GSF_CPU_SCALAR)
                 bench_stages(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads);
         }
