@@ -4825,7 +4825,7 @@ typedef struct gsf__knn_tree {
     gsf__arena arena;
 } gsf__knn_tree;
 
-enum { GSF__KNN_LEAF = 8, GSF__KNN_MAX = 64, GSF__KNN_CHUNK = 1024, GSF__KNN_SPLIT = 8 };
+enum { GSF__KNN_LEAF = 8, GSF__KNN_MAX = 64, GSF__KNN_CHUNK = 128, GSF__KNN_SPLIT = 8 };
 
 static size_t gsf__knn_begin(const gsf__knn_tree* tree, uint32_t level, size_t node) {
     return (size_t)(((uint64_t)tree->count * node) >> level); // count and node are below 2^32
@@ -4843,12 +4843,27 @@ static void gsf__knn_swap(gsf__knn_tree* tree, size_t a, size_t b) {
     tree->rows[b] = row;
 }
 
+// A coordinate close to that of the point which sorting [begin,end) along the axis would bring to nth. From a pseudorandom,
+// but reproducible sample.
+static double gsf__knn_pivot(const gsf__knn_tree* tree, size_t begin, size_t nth, size_t end, int axis) {
+    enum { MOST = 31 };
+    const size_t size = end - begin, count = size > 32 * MOST ? MOST : size > 32 ? 3 : 1;
+    double sample[MOST];
+    for (size_t n = 0; n < count; n++) { // sorted
+        const size_t pick = begin + (size_t)(gsf_draw_bits(begin, end, nth + n) % size);
+        const double x = tree->points[3 * pick + (size_t)axis];
+        size_t at = n;
+        for (; at > 0 && sample[at - 1] > x; at--) sample[at] = sample[at - 1];
+        sample[at] = x;
+    }
+    return sample[(nth - begin) * count / size];
+}
+
 // Quickselect: afterwards no point in [begin,nth) is above, and none in [nth,end) below, point nth along the axis. The
-// three-way partition handles equal coordinates in linear time; the pivots are pseudorandom but reproducible.
+// three-way partition handles equal coordinates in linear time.
 static void gsf__knn_select(gsf__knn_tree* tree, size_t begin, size_t nth, size_t end, int axis) {
     while (end - begin > 1) {
-        const size_t pick = begin + (size_t)(gsf_draw_bits(begin, end, nth) % (end - begin));
-        const double pivot = tree->points[3 * pick + (size_t)axis];
+        const double pivot = gsf__knn_pivot(tree, begin, nth, end, axis);
         size_t below = begin, above = end;
         for (size_t i = begin; i < above;) {
             const double x = tree->points[3 * i + (size_t)axis];
@@ -4935,57 +4950,92 @@ static double gsf__distance2(const double a[3], const double b[3]) {
     return x * x + y * y + z * z;
 }
 
-static double gsf__knn_box_distance2(const double box[6], const double q[3]) {
+static double gsf__knn_box_distance2(const double a[6], const double b[6]) {
     double sum = 0.0;
     for (int k = 0; k < 3; k++) {
-        const double below = box[k] - q[k], above = q[k] - box[3 + k], d = below > above ? below : above;
+        const double below = b[k] - a[3 + k], above = a[k] - b[3 + k], d = below > above ? below : above;
         sum += d > 0.0 ? d * d : 0.0;
     }
     return sum;
 }
 
-// Finds the k points nearest to q (k <= GSF__KNN_MAX), nearest first: squared distances and positions in tree order.
-// The point at position `skip` is excluded (SIZE_MAX: none). Returns the number found, which is less than k only if the
-// tree has too few points. Ties depend only on the tree.
-static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, int k, double* distance2,
-                          size_t* places) {
-    struct { size_t node; double distance2; uint32_t level; } stack[40];
-    int depth = 0, found = 0;
-    double beyond = (double)INFINITY; // squared distance from which on no point is wanted
-    if (tree->count == 0) return 0;
-    stack[depth].node = 0;
-    stack[depth].distance2 = 0.0;
-    stack[depth++].level = 0;
-    while (depth > 0) {
-        depth--;
-        size_t node = stack[depth].node;
-        uint32_t level = stack[depth].level;
-        if (stack[depth].distance2 >= beyond) continue;
-        while (level < tree->levels) { // descend to the nearer child, push the farther
-            level++;
-            const double* boxes = tree->boxes + 6 * (((size_t)1 << level) - 1 + 2 * node);
-            const double left = gsf__knn_box_distance2(boxes, q), right = gsf__knn_box_distance2(boxes + 6, q);
-            const size_t far_bit = left <= right;
-            stack[depth].node = 2 * node + far_bit;
-            stack[depth].distance2 = far_bit ? right : left;
-            stack[depth++].level = level;
-            node = 2 * node + (1 - far_bit);
-        }
-        const size_t end = gsf__knn_begin(tree, level, node + 1);
-        for (size_t i = gsf__knn_begin(tree, level, node); i < end; i++) {
-            const double d = gsf__distance2(tree->points + 3 * i, q);
-            if (i == skip || d >= beyond) continue;
-            int at = found < k ? found++ : k - 1;
+typedef struct gsf__knn_near { // of each point of a leaf, the other points that are nearest to it, nearest first
+    size_t first, end; // the leaf
+    int wanted, found[GSF__KNN_LEAF + 1];
+    double distance2[GSF__KNN_LEAF + 1][GSF__KNN_MAX];
+    size_t places[GSF__KNN_LEAF + 1][GSF__KNN_MAX]; // in tree order
+    double beyond; // squared distance from which on no point is wanted
+} gsf__knn_near;
+
+static void gsf__knn_meet(const gsf__knn_tree* tree, size_t leaf, gsf__knn_near* nearby) {
+    const size_t first = gsf__knn_begin(tree, tree->levels, leaf), end = gsf__knn_begin(tree, tree->levels, leaf + 1);
+    nearby->beyond = 0.0;
+    for (size_t i = nearby->first; i < nearby->end; i++) {
+        double *distance2 = nearby->distance2[i - nearby->first], beyond = (double)INFINITY;
+        size_t* places = nearby->places[i - nearby->first];
+        int found = nearby->found[i - nearby->first];
+        if (found == nearby->wanted) beyond = distance2[found - 1];
+        for (size_t j = first; j < end; j++) {
+            const double d = gsf__distance2(tree->points + 3 * i, tree->points + 3 * j);
+            if (d >= beyond || j == i) continue;
+            int at = found < nearby->wanted ? found++ : found - 1;
             for (; at > 0 && distance2[at - 1] > d; at--) {
                 distance2[at] = distance2[at - 1];
                 places[at] = places[at - 1];
             }
             distance2[at] = d;
-            places[at] = i;
-            if (found == k) beyond = distance2[k - 1];
+            places[at] = j;
+            if (found == nearby->wanted) beyond = distance2[found - 1];
+        }
+        nearby->found[i - nearby->first] = found;
+        if (beyond > nearby->beyond) nearby->beyond = beyond;
+    }
+}
+
+// Finds the k points nearest to each point of a leaf (k <= GSF__KNN_MAX), or all if there are fewer. One search serves all
+// points of the leaf. Ties depend only on the tree.
+static void gsf__knn_leaf(const gsf__knn_tree* tree, size_t leaf, int k, gsf__knn_near* nearby) {
+    struct { size_t node; double distance2; uint32_t level; } stack[40];
+    const double* box = tree->boxes + 6 * (((size_t)1 << tree->levels) - 1 + leaf);
+    nearby->first = gsf__knn_begin(tree, tree->levels, leaf);
+    nearby->end = gsf__knn_begin(tree, tree->levels, leaf + 1);
+    nearby->wanted = k;
+    memset(nearby->found, 0, sizeof nearby->found);
+    gsf__knn_meet(tree, leaf, nearby);
+    for (uint32_t up = 0; up < tree->levels; up++) { // the other half of each node that contains the leaf
+        int depth = 1;
+        stack[0].level = tree->levels - up;
+        stack[0].node = (leaf >> up) ^ 1;
+        stack[0].distance2 =
+            gsf__knn_box_distance2(box, tree->boxes + 6 * (((size_t)1 << stack[0].level) - 1 + stack[0].node));
+        while (depth > 0) {
+            depth--;
+            size_t node = stack[depth].node;
+            uint32_t level = stack[depth].level;
+            if (stack[depth].distance2 >= nearby->beyond) continue;
+            while (level < tree->levels) { // descend to the nearer child, push the farther
+                level++;
+                const double* boxes = tree->boxes + 6 * (((size_t)1 << level) - 1 + 2 * node);
+                const double left = gsf__knn_box_distance2(box, boxes), right = gsf__knn_box_distance2(box, boxes + 6);
+                const size_t far_bit = left <= right;
+                stack[depth].node = 2 * node + far_bit;
+                stack[depth].distance2 = far_bit ? right : left;
+                stack[depth++].level = level;
+                node = 2 * node + (1 - far_bit);
+            }
+            gsf__knn_meet(tree, node, nearby);
         }
     }
-    return found;
+}
+
+// Chunks of leaves.
+static size_t gsf__knn_chunks(const gsf__knn_tree* tree) {
+    return tree->count ? (((size_t)1 << tree->levels) + GSF__KNN_CHUNK - 1) / GSF__KNN_CHUNK : 0;
+}
+
+static size_t gsf__knn_chunk_end(const gsf__knn_tree* tree, size_t chunk) {
+    const size_t leaves = (size_t)1 << tree->levels, end = (chunk + 1) * GSF__KNN_CHUNK;
+    return end < leaves ? end : leaves;
 }
 
 typedef struct gsf__init_job {
@@ -4996,15 +5046,16 @@ typedef struct gsf__init_job {
 static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__init_job* job = (const gsf__init_job*)arg;
-    const size_t first = chunk * GSF__KNN_CHUNK;
-    for (size_t i = first; i < job->tree->count && i < first + GSF__KNN_CHUNK; i++) {
-        double distance2[3];
-        size_t places[3];
-        const int found = gsf__knn_query(job->tree, job->tree->points + 3 * i, i, 3, distance2, places);
-        double mean = 0.0;
-        for (int k = 0; k < found; k++) mean += distance2[k];
-        if (found) mean /= found;
-        job->log_scales[i] = (float)(0.5 * gsf__log_f64(mean > 1e-7 ? mean : 1e-7));
+    gsf__knn_near nearby;
+    for (size_t leaf = chunk * GSF__KNN_CHUNK; leaf < gsf__knn_chunk_end(job->tree, chunk); leaf++) {
+        gsf__knn_leaf(job->tree, leaf, 3, &nearby);
+        for (size_t i = nearby.first; i < nearby.end; i++) {
+            const int found = nearby.found[i - nearby.first];
+            double mean = 0.0;
+            for (int k = 0; k < found; k++) mean += nearby.distance2[i - nearby.first][k];
+            if (found) mean /= found;
+            job->log_scales[i] = (float)(0.5 * gsf__log_f64(mean > 1e-7 ? mean : 1e-7));
+        }
     }
 }
 
@@ -5031,7 +5082,7 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
         gsf__init_job job;
         job.tree = &tree;
         job.log_scales = log_scales;
-        gsf__parallel_for(ctx, (tree.count + GSF__KNN_CHUNK - 1) / GSF__KNN_CHUNK, gsf__init_scales_chunk, &job);
+        gsf__parallel_for(ctx, gsf__knn_chunks(&tree), gsf__init_scales_chunk, &job);
 
         size_t kept = 0, n = 0;
         for (size_t i = 0; i < count; i++) order[i] = UINT32_MAX;
@@ -5066,6 +5117,16 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
 #else
 #define GSF__LINES
 #endif
+
+static int gsf__lowest_bit(uint32_t mask) {
+#if defined(__GNUC__) || defined(__clang__)
+    return __builtin_ctz(mask);
+#else
+    int bit = 0;
+    while (!(mask >> bit & 1u)) bit++;
+    return bit;
+#endif
+}
 
 typedef struct gsf__disc { // Embree reads it where it lies, centre with radius and normal by 16 bytes each
     float center[3], radius;
@@ -5131,42 +5192,46 @@ typedef struct gsf__disc_job {
     gsf__discs* discs;
 } gsf__disc_job;
 
+// Makes the disc of the point at position i, given the points nearest to it.
+static void gsf__disc_make(const gsf__disc_job* job, size_t i, const size_t* places, const double* distance2, int found) {
+    const gsf__knn_tree* tree = job->tree;
+    const double* p = tree->points + 3 * i;
+    const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
+    double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
+    memset(cov, 0, sizeof cov);
+    for (int k = 0; k < used; k++)
+        for (int a = 0; a < 3; a++) mean[a] += (tree->points[3 * places[k] + (size_t)a] - p[a]) / (used + 1);
+    for (int k = -1; k < used; k++) {
+        double d[3];
+        for (int a = 0; a < 3; a++) d[a] = (k < 0 ? 0.0 : tree->points[3 * places[k] + (size_t)a] - p[a]) - mean[a];
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++) cov[3 * a + b] += d[a] * d[b];
+    }
+    double values[3], axes[9];
+    gsf__mat3_eigen(cov, values, axes);
+    const double* normal = axes + 6; // the direction of least variance
+    uint32_t* nearest = job->discs->nearest + (size_t)job->discs->near_count * i;
+    for (int k = 0; k < used; k++) nearest[k] = (uint32_t)places[k];
+    const int at = found < job->desc->radius_neighbour ? found : job->desc->radius_neighbour;
+    gsf__disc* disc = job->discs->all + i;
+    for (int a = 0; a < 3; a++) {
+        disc->center[a] = (float)(p[a] - job->discs->origin[a]);
+        disc->normal[a] = (float)normal[a];
+    }
+    disc->radius = (float)(at ? (double)job->desc->radius_scale * sqrt(distance2[at - 1]) : 0.0);
+    job->discs->rows[i] = tree->rows[i];
+}
+
 static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__disc_job* job = (const gsf__disc_job*)arg;
-    const gsf__knn_tree* tree = job->tree;
-    const int wanted = job->desc->neighbours > job->desc->radius_neighbour ? job->desc->neighbours
-                                                                          : job->desc->radius_neighbour;
-    const size_t first = chunk * GSF__KNN_CHUNK;
-    for (size_t i = first; i < tree->count && i < first + GSF__KNN_CHUNK; i++) {
-        const double* p = tree->points + 3 * i;
-        double distance2[GSF__KNN_MAX];
-        size_t places[GSF__KNN_MAX];
-        const int found = gsf__knn_query(tree, p, i, wanted, distance2, places);
-        const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
-        double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
-        memset(cov, 0, sizeof cov);
-        for (int k = 0; k < used; k++)
-            for (int a = 0; a < 3; a++) mean[a] += (tree->points[3 * places[k] + (size_t)a] - p[a]) / (used + 1);
-        for (int k = -1; k < used; k++) {
-            double d[3];
-            for (int a = 0; a < 3; a++) d[a] = (k < 0 ? 0.0 : tree->points[3 * places[k] + (size_t)a] - p[a]) - mean[a];
-            for (int a = 0; a < 3; a++)
-                for (int b = 0; b < 3; b++) cov[3 * a + b] += d[a] * d[b];
-        }
-        double values[3], axes[9];
-        gsf__mat3_eigen(cov, values, axes);
-        const double* normal = axes + 6; // the direction of least variance
-        uint32_t* nearest = job->discs->nearest + (size_t)job->discs->near_count * i;
-        for (int k = 0; k < used; k++) nearest[k] = (uint32_t)places[k];
-        const int at = found < job->desc->radius_neighbour ? found : job->desc->radius_neighbour;
-        gsf__disc* disc = job->discs->all + i;
-        for (int a = 0; a < 3; a++) {
-            disc->center[a] = (float)(p[a] - job->discs->origin[a]);
-            disc->normal[a] = (float)normal[a];
-        }
-        disc->radius = (float)(at ? (double)job->desc->radius_scale * sqrt(distance2[at - 1]) : 0.0);
-        job->discs->rows[i] = tree->rows[i];
+    const gsf_visibility_desc* desc = job->desc;
+    const int wanted = desc->neighbours > desc->radius_neighbour ? desc->neighbours : desc->radius_neighbour;
+    gsf__knn_near nearby;
+    for (size_t leaf = chunk * GSF__KNN_CHUNK; leaf < gsf__knn_chunk_end(job->tree, chunk); leaf++) {
+        gsf__knn_leaf(job->tree, leaf, wanted, &nearby);
+        for (size_t i = nearby.first, k = 0; i < nearby.end; i++, k++)
+            gsf__disc_make(job, i, nearby.places[k], nearby.distance2[k], nearby.found[k]);
     }
 }
 
@@ -5219,7 +5284,7 @@ static gsf_result gsf__discs_make(gsf__arena* arena, const gsf_scene* scene, con
     job.tree = &tree;
     job.desc = desc;
     job.discs = discs;
-    gsf__parallel_for(ctx, (count + GSF__KNN_CHUNK - 1) / GSF__KNN_CHUNK, gsf__discs_chunk, &job);
+    gsf__parallel_for(ctx, gsf__knn_chunks(&tree), gsf__discs_chunk, &job);
     {
         size_t n = 0;
         for (size_t i = 0; i < count; i++) // clusters of identical points have radius 0 and are ignored
@@ -5268,6 +5333,7 @@ typedef struct gsf__look { // of an eye at the discs
 } gsf__look;
 
 typedef struct gsf__rays gsf__rays;
+typedef struct gsf__unseen gsf__unseen;
 typedef struct gsf__hiders gsf__hiders;
 
 enum { GSF__VIS_CHUNK = 1024, GSF__VIS_LOOKS = 8, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 4096 };
@@ -5281,7 +5347,9 @@ typedef struct gsf__vis_job {
     uint8_t* seen;             // (count) points set on entry are not traced
     gsf__vis_counts* counts;   // per chunk of discs, so that summing needs no atomics
     void* embree_scene;
-    int (*hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, int open); // see >>embree
+    gsf__unseen* unseen;       // per worker; see >>embree
+    uint32_t (*aim)(const gsf__unseen* unseen, int first, float grazing, gsf__rays* rays);
+    uint32_t (*hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, uint32_t open);
     // evidence from the tracks
     const gsf_scene* scene;
     double* centers;           // (view_count,3) centres of all views, relative to the discs' origin
@@ -5817,7 +5885,7 @@ GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* sc
    Every chunk of points is tested for several eyes in turn, so that the discs stay in the cache. */
 enum { GSF__VIS_GROUP = 16, GSF__VIS_GROUPS = GSF__VIS_CHUNK / GSF__VIS_GROUP, GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
-struct gsf__rays {
+struct gsf__rays { // from an eye to a group of points
     GSF__LINES float direction[3][GSF__VIS_GROUP];
     float distance[GSF__VIS_GROUP];
     float error[GSF__VIS_GROUP]; // ten times a bound of that of a distance along the ray, times a slope
@@ -5828,10 +5896,17 @@ struct gsf__rays {
     float tolerance;
 };
 
+struct gsf__unseen { // the points of a chunk that no eye before has seen, in groups
+    int count;
+    float center[3][GSF__VIS_CHUNK], normal[3][GSF__VIS_CHUNK];
+    float own[GSF__VIS_CHUNK]; // as in gsf__rays
+    uint32_t points[GSF__VIS_CHUNK];
+};
+
 struct gsf__hiders { // discs that may hide points, in the order in which they are tested
     int count, next;                  // next: the first that was not tested
-    uint32_t discs[GSF__VIS_QUEUE];
-    uint16_t covered[GSF__VIS_QUEUE]; // bits: rays of the group that it covers
+    uint32_t discs[GSF__VIS_QUEUE + 1];
+    uint16_t covered[GSF__VIS_QUEUE]; // bits: rays of the group that it covers, of those that were open
     uint64_t queued[16];              // bit set of the discs, by disc modulo 1024
 };
 
@@ -5846,14 +5921,36 @@ struct gsf__hiders { // discs that may hide points, in the order in which they a
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_HIDE
 
+// Aims the rays at the group of points from `first` on, and returns those (bits) that meet their discs at an angle whose
+// cosine is above `grazing`.
+GSF__V_KERNEL uint32_t GSF__V(gsf__aim)(const gsf__unseen* unseen, int first, float grazing, gsf__rays* rays) {
+    uint32_t clear = 0;
+    for (int l = 0; l < GSF__VIS_GROUP; l += GSF__LANES) {
+        gsf__vf d[3], along = gsf__v_set(0.0f), length2 = along;
+        for (int k = 0; k < 3; k++) { // as precise as if it were rounded from double
+            d[k] = (gsf__v_load(unseen->center[k] + first + l) - gsf__v_set(rays->eye[k])) - gsf__v_set(rays->rest[k]);
+            along = gsf__v_madd(d[k], gsf__v_load(unseen->normal[k] + first + l), along);
+            length2 = gsf__v_madd(d[k], d[k], length2);
+        }
+        const gsf__vf distance = gsf__v_sqrt(length2), inverse = gsf__v_set(1.0f) / distance;
+        for (int k = 0; k < 3; k++) gsf__v_store(rays->direction[k] + l, d[k] * inverse);
+        gsf__v_store(rays->distance + l, distance);
+        gsf__v_store(rays->error + l, gsf__v_set(1e-5f) * distance);
+        gsf__v_store(rays->own + l, gsf__v_load(unseen->own + first + l));
+        gsf__v_store(rays->cover + l, gsf__v_set(0.0f));
+        clear |= gsf__vm_bits(gsf__v_gt(gsf__v_abs(along) * inverse, gsf__v_set(grazing))) << l;
+    }
+    return clear;
+}
+
 // Adds lower bounds of the discs' cover to the rays, disc by disc, until none of the rays `open` (bits) remains that is not
 // proved hidden. Returns those that remain.
-GSF__V_KERNEL int GSF__V(gsf__hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, int open) {
+GSF__V_KERNEL uint32_t GSF__V(gsf__hide)(const gsf__disc* discs, gsf__rays* rays, gsf__hiders* hiders, uint32_t open) {
     const gsf__vf one = gsf__v_set(1.0f), zero = gsf__v_set(0.0f);
     for (; open && hiders->next < hiders->count; hiders->next++) {
         const gsf__disc* disc = discs + hiders->discs[hiders->next];
         const float* n = disc->normal;
-        const float cx = (disc->center[0] - rays->eye[0]) - rays->rest[0]; // as precise as if it were rounded from double
+        const float cx = (disc->center[0] - rays->eye[0]) - rays->rest[0];
         const float cy = (disc->center[1] - rays->eye[1]) - rays->rest[1];
         const float cz = (disc->center[2] - rays->eye[2]) - rays->rest[2];
         const float plane = cx * n[0] + cy * n[1] + cz * n[2], reach = rays->tolerance * disc->radius;
@@ -5876,8 +5973,8 @@ GSF__V_KERNEL int GSF__V(gsf__hide)(const gsf__disc* discs, gsf__rays* rays, gsf
             covered |= gsf__vm_bits(hit) << l;
             left |= gsf__vm_bits(gsf__v_lt(sum, gsf__v_load(rays->need + l))) << l;
         }
-        hiders->covered[hiders->next] = (uint16_t)covered;
-        open &= (int)left;
+        hiders->covered[hiders->next] = (uint16_t)(covered & open);
+        open &= left;
     }
     return open;
 }
@@ -5898,22 +5995,23 @@ typedef struct gsf__embree_query { // starts with Embree's context, whose addres
     gsf__sight sight;
     size_t point;
     double cover, limit;  // cover of the discs hit so far; cover at which the point is hidden
-    // the current group of points
-    size_t points[GSF__VIS_GROUP];
-    int ray_count;
+    gsf__unseen* unseen;  // of the chunk
+    // the current group
     gsf__rays rays;
     gsf__hiders hiders;   // starts with discs that covered points of the previous group
-    // of each group of the chunk, some of the discs that covered points of it from the last eye
-    int group, found_count[GSF__VIS_GROUPS];
+    // of each group, some of the discs that covered points of it from the last eye
+    int found_count[GSF__VIS_GROUPS];
     uint32_t found[GSF__VIS_GROUPS][GSF__VIS_HIDERS];
 } gsf__embree_query;
 
+// Without branches: whether a disc is queued already is hard to predict.
 static void gsf__hiders_add(gsf__hiders* h, const gsf__discs* discs, uint32_t disc) {
-    uint64_t *word = h->queued + (disc >> 6 & 15u), bit = (uint64_t)1 << (disc & 63u);
-    if ((*word & bit) || h->count == GSF__VIS_QUEUE) return;
-    *word |= bit;
-    h->discs[h->count++] = disc;
+    uint64_t* word = h->queued + (disc >> 6 & 15u);
+    const int is_new = !(*word >> (disc & 63u) & 1u) & (h->count < GSF__VIS_QUEUE);
     gsf__v_fetch_scalar(discs->all[disc].center);
+    h->discs[h->count] = disc;
+    h->count += is_new;
+    *word |= (uint64_t)1 << (disc & 63u);
 }
 
 // Embree calls this for every disc that the ray hits, in no particular order. Rejecting the hit continues the
@@ -5970,7 +6068,7 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
 
 // Tests the rays against the queued discs, and then against the neighbours of discs that cover an open ray. `open`: bits of
 // the rays not yet proved hidden; returns those that remain. *expanded: the first disc whose neighbours are not queued yet.
-static int gsf__embree_meet(gsf__embree_query* q, int* expanded, int open) {
+static uint32_t gsf__embree_meet(gsf__embree_query* q, int* expanded, uint32_t open) {
     const gsf__discs* discs = &q->job->discs;
     gsf__hiders* h = &q->hiders;
     for (;;) {
@@ -5983,86 +6081,86 @@ static int gsf__embree_meet(gsf__embree_query* q, int* expanded, int open) {
     }
 }
 
-static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
+// Tests the points of the group from `first` on whose bits are set.
+static void gsf__embree_group(gsf__embree_query* q, int first, uint32_t open, gsf__vis_counts* counts) {
     gsf__hiders* h = &q->hiders;
-    uint32_t* found = q->found[q->group];
-    int* found_count = q->found_count + q->group++;
-    for (int l = q->ray_count; l < GSF__VIS_GROUP; l++) { // unused lanes
-        q->rays.direction[0][l] = q->rays.direction[1][l] = q->rays.direction[2][l] = 0.0f;
-        q->rays.distance[l] = q->rays.error[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
-    }
+    uint32_t* found = q->found[first / GSF__VIS_GROUP];
+    int* found_count = q->found_count + first / GSF__VIS_GROUP;
     for (int k = 0; k < *found_count; k++) gsf__hiders_add(h, &q->job->discs, found[k]);
-    int expanded = 0, open = gsf__embree_meet(q, &expanded, (1 << q->ray_count) - 1);
-    for (int l = 0; l < q->ray_count; l++) {
-        counts->rays += open >> l & 1;
-        counts->culled += !(open >> l & 1);
-        if (!(open >> l & 1)) continue;
-        gsf__embree_ray(q, q->points[l]);
-        open = gsf__embree_meet(q, &expanded, open & ~(1 << l)); // discs that the ray found may hide the others
+    int expanded = 0, useful = 0;
+    open = gsf__embree_meet(q, &expanded, open);
+    while (open) {
+        const int l = gsf__lowest_bit(open);
+        counts->rays++;
+        counts->culled--;
+        gsf__embree_ray(q, q->unseen->points[first + l]);
+        open = gsf__embree_meet(q, &expanded, open & (open - 1)); // discs that the ray found may hide the others
     }
-    *found_count = q->ray_count = h->count = 0;
+    for (int k = 0; k < h->next && useful < GSF__VIS_HIDERS; k++) {
+        found[useful] = h->discs[k];
+        useful += h->covered[k] != 0;
+    }
+    *found_count = useful;
+    h->count = h->next = 0;
     memset(h->queued, 0, sizeof h->queued);
-    for (int k = 0; k < h->next && *found_count < GSF__VIS_HIDERS; k++) {
-        if (!h->covered[k]) continue;
-        gsf__hiders_add(h, &q->job->discs, h->discs[k]); // at or before its old place
-        found[(*found_count)++] = h->discs[k];
-    }
-    h->next = 0;
+    for (int k = 0; k < useful; k++) gsf__hiders_add(h, &q->job->discs, found[k]);
 }
 
-// Tests the points of a chunk that no eye has seen yet for one eye.
+// Tests the chunk's points that no eye has seen yet for one eye.
 static void gsf__embree_look(gsf__embree_query* q, const gsf__look* look, size_t chunk, gsf__vis_counts* counts) {
     const gsf__vis_job* job = q->job;
-    gsf__rays* rays = &q->rays;
-    const size_t first = chunk * GSF__VIS_CHUNK;
     const int side = gsf__vis_side(look->eye, job->regions + 6 * chunk);
     const float grazing = job->desc->min_grazing_cos + 1e-5f;
     q->look = look;
-    q->group = q->hiders.count = 0;
+    q->hiders.count = 0;
     memset(q->hiders.queued, 0, sizeof q->hiders.queued);
     for (int k = 0; k < 3; k++) {
-        rays->eye[k] = (float)look->eye->center[k];
-        rays->rest[k] = (float)(look->eye->center[k] - (double)rays->eye[k]);
+        q->rays.eye[k] = (float)look->eye->center[k];
+        q->rays.rest[k] = (float)(look->eye->center[k] - (double)q->rays.eye[k]);
     }
-    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
-        if (job->seen[i]) continue;
-        const gsf__disc* disc = job->discs.all + i;
-        const int l = q->ray_count;
-        float d[3];
-        for (int k = 0; k < 3; k++) d[k] = (disc->center[k] - rays->eye[k]) - rays->rest[k];
-        const float distance = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), inverse = 1.0f / distance;
-        for (int k = 0; k < 3; k++) rays->direction[k][l] = d[k] * inverse;
-        const float cosine = (d[0] * disc->normal[0] + d[1] * disc->normal[1] + d[2] * disc->normal[2]) * inverse;
-        const int clear = side > 0 && fabsf(cosine) > grazing; // otherwise gsf__vis_sight decides in double
-        float limit = 0.0f;
-        if (clear || (side >= 0 && gsf__vis_sight(job, look->eye, i, &q->sight))) limit = gsf__vis_limit(job, look, i);
-        if (!(limit > 0.0f)) {
+    for (int first = 0; first < q->unseen->count; first += GSF__VIS_GROUP) {
+        const uint32_t clear = job->aim(q->unseen, first, grazing, &q->rays);
+        uint32_t open = 0;
+        for (int l = 0; l < GSF__VIS_GROUP && first + l < q->unseen->count; l++) {
+            const size_t i = q->unseen->points[first + l];
+            if (job->seen[i]) continue;
+            const int in_frame = side > 0 && (clear >> l & 1u); // otherwise gsf__vis_sight decides in double
+            float limit = 0.0f;
+            if (in_frame || (side >= 0 && gsf__vis_sight(job, look->eye, i, &q->sight))) limit = gsf__vis_limit(job, look, i);
+            q->rays.need[l] = limit * 1.00001f;
+            open |= (uint32_t)(limit > 0.0f) << l;
             counts->culled++;
-            continue;
         }
-        q->points[l] = i;
-        rays->distance[l] = distance;
-        rays->error[l] = 1e-5f * distance;
-        rays->own[l] = job->desc->tolerance * disc->radius;
-        rays->cover[l] = 0.0f;
-        rays->need[l] = limit * 1.00001f;
-        if (++q->ray_count == GSF__VIS_GROUP) gsf__embree_group(q, counts);
+        if (open) gsf__embree_group(q, first, open, counts);
     }
-    if (q->ray_count) gsf__embree_group(q, counts);
 }
 
 static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
-    (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
+    const size_t first = chunk * GSF__VIS_CHUNK;
+    gsf__unseen* unseen = job->unseen + worker;
     gsf__embree_query query;
     memset(&query, 0, sizeof query);
     query.job = job;
+    query.unseen = unseen;
     query.rays.tolerance = job->desc->tolerance;
 #if RTC_VERSION_MAJOR < 4
     rtcInitIntersectContext(&query.context);
 #else
     rtcInitRayQueryContext(&query.context);
 #endif
+    unseen->count = 0;
+    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
+        if (job->seen[i]) continue;
+        const gsf__disc* disc = job->discs.all + i;
+        const int at = unseen->count++;
+        for (int k = 0; k < 3; k++) {
+            unseen->center[k][at] = disc->center[k];
+            unseen->normal[k][at] = disc->normal[k];
+        }
+        unseen->own[at] = job->desc->tolerance * disc->radius;
+        unseen->points[at] = (uint32_t)i;
+    }
     for (size_t k = 0; k < job->look_count; k++) gsf__embree_look(&query, job->looks + k, chunk, job->counts + chunk);
 }
 
@@ -6104,6 +6202,9 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
+    job->unseen = (gsf__unseen*)gsf__arena_alloc_zeroed(&job->arena, (size_t)ctx->parallel.worker_count, sizeof(gsf__unseen));
+    if (!job->unseen) return GSF_ERROR_OUT_OF_MEMORY;
+    job->aim = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__aim);
     job->hide = GSF__ANY_KERNEL_OF(ctx->cpu_level, gsf__hide);
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e += GSF__VIS_LOOKS) {
         gsf__vis_look(ctx, job, e);
@@ -8421,9 +8522,10 @@ enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
 typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
     void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
-    // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry
-    // that brings the kept steps above GSF__BUCKET pixels / 8, or the last of those that are processed together with it.
-    // Returns the entry to continue with, or tile->count when done. step_count: of gsf__step or gsf__wide_step
+    // Repeats the blending of T (aligned as in gsf__tile_state) for list entries from `first` to `last` and keeps the steps.
+    // Stops after the entry that brings the kept steps above GSF__BUCKET pixels / 8, or the last of those that are processed
+    // together with it. Returns the entry to continue with, or tile->count when done. step_count: of gsf__step or
+    // gsf__wide_step
     size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
                    size_t* step_count);
     // Goes back to front over kept steps and writes the sums of the gradient moments of each entry to its slot (12
@@ -8482,16 +8584,6 @@ static uint32_t gsf__live_steps(const float* T) {
         for (int lane = 0; lane < 8; lane++)
             if (T[8 * s + (uint32_t)lane] > 0.0f) live |= 1u << s;
     return live;
-}
-
-static int gsf__lowest_bit(uint32_t mask) {
-#if defined(__GNUC__) || defined(__clang__)
-    return __builtin_ctz(mask);
-#else
-    int bit = 0;
-    while (!(mask >> bit & 1u)) bit++;
-    return bit;
-#endif
 }
 
 // Blends a splat into the T of one pixel. Returns its alpha before the clamp, or 0 if it is not blended.

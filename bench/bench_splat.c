@@ -93,7 +93,7 @@ static void bench_count_tile(void* arg, size_t index, int32_t worker) {
     const bench_count* job = (const bench_count*)arg;
     const gsf__tile tile = gsf__tile_of(job->r, index);
     const gsf__worker_scratch* scratch = job->r->workers + worker;
-    float T[GSF__TILE_PIXELS];
+    GSF__LINES float T[GSF__TILE_PIXELS];
     int columns, rows;
     gsf__tile_extent(job->r, &tile, &columns, &rows);
     gsf__open_tile(T, columns, rows);
@@ -134,7 +134,13 @@ static void bench_lap(bench_clock* clock, int stage) { // assigns the time since
 static void bench_stages(const bench_options* o, const char* name, size_t count, double size, int width, int height,
                          gsf_cpu_level level, int threads) {
     gsf_context ctx;
-    if (!bench_context(&ctx, level, threads)) return;
+    char label[80];
+    int wanted = !o->filter;
+    for (int k = 0; k <= STAGES && !wanted; k++) {
+        snprintf(label, sizeof label, "%s: %s", name, k < STAGES ? bench_stage_names[k] : "step");
+        wanted = strstr(label, o->filter) != NULL;
+    }
+    if (!wanted || !bench_context(&ctx, level, threads)) return;
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
     bench_require(&ctx, gsf_splat_sort(&ctx, &splats));
@@ -253,7 +259,6 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
         entries * (GSF__SLOT_FLOATS * 4 + 8) + n * (59 * 4 * 3 + sizeof(gsf__record)),
         n * 59 * 4 * 7,
     };
-    char label[80];
     for (int k = 0; k < STAGES; k++) {
         const int by_pair = k == STAGE_BLEND || k == STAGE_REVERSE, by_pixel = k == STAGE_LOSS;
         snprintf(label, sizeof label, "%s: %s", name, bench_stage_names[k]);

@@ -47,11 +47,13 @@ static void check_neighbours(int kind, size_t count, int k) {
     CHECK_OK(&ctx, gsf__knn_build(&ctx, points, count, NULL, &tree));
     CHECK(tree.count == count);
     int wrong_count = 0, wrong_distance = 0, wrong_place = 0;
-    for (size_t i = 0; i < count; i++) {
-        double distance2[GSF__KNN_MAX];
-        size_t places[GSF__KNN_MAX];
-        const double* q = tree.points + 3 * i;
-        const int found = gsf__knn_query(&tree, q, i, k, distance2, places);
+    gsf__knn_near nearby;
+    nearby.end = 0;
+    for (size_t i = 0, leaf = 0; i < count; i++) {
+        if (i == nearby.end) gsf__knn_leaf(&tree, leaf++, k, &nearby);
+        const double *q = tree.points + 3 * i, *distance2 = nearby.distance2[i - nearby.first];
+        const size_t* places = nearby.places[i - nearby.first];
+        const int found = nearby.found[i - nearby.first];
         size_t n = 0;
         for (size_t j = 0; j < count; j++) {
             if (j == tree.rows[i]) continue;
@@ -95,11 +97,10 @@ static void test_neighbours(void) {
         CHECK_OK(&ctx, gsf__knn_build(&ctx, points, many, NULL, &tree));
         const double built = gsf__seconds();
         double sum = 0.0;
-        for (size_t i = 0; i < many; i++) {
-            double distance2[12];
-            size_t places[12];
-            const int found = gsf__knn_query(&tree, tree.points + 3 * i, i, 12, distance2, places);
-            sum += found == 12 ? distance2[11] : NAN;
+        for (size_t leaf = 0; leaf < (size_t)1 << tree.levels; leaf++) {
+            gsf__knn_near nearby;
+            gsf__knn_leaf(&tree, leaf, 12, &nearby);
+            for (size_t k = 0; k < nearby.end - nearby.first; k++) sum += nearby.found[k] == 12 ? nearby.distance2[k][11] : NAN;
         }
         CHECK(isfinite(sum));
         printf("neighbours: cloud %d, %zu points: tree %.2f s, 12 nearest of all %.2f s\n", kind, many, built - start,
