@@ -5880,9 +5880,9 @@ GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* sc
 
 /* In a dense cloud most points are hidden from most views, neighbouring points are hidden by the same discs, and so is a
    point from the next view. So groups of sixteen neighbouring points are first tested, in float with bounds on all rounding
-   errors, against the discs that hid the previous group and those that hid such a group from the previous eye, then against
-   the neighbours of the discs that cover a point. Only points that these tests do not prove hidden are traced with Embree.
-   Every chunk of points is tested for several eyes in turn, so that the discs stay in the cache. */
+   errors, against the discs that hid the group before and those that hid this one from the previous eye, then against the
+   neighbours of the discs that cover a point. Only points that these tests do not prove hidden are traced with Embree. Every
+   chunk of points is tested for several eyes in turn, so that the discs stay in the cache. */
 enum { GSF__VIS_GROUP = 16, GSF__VIS_GROUPS = GSF__VIS_CHUNK / GSF__VIS_GROUP, GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
 struct gsf__rays { // from an eye to a group of points
