@@ -8522,10 +8522,9 @@ enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
 typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
     void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
-    // Repeats the blending of T (aligned as in gsf__tile_state) for list entries from `first` to `last` and keeps the steps.
-    // Stops after the entry that brings the kept steps above GSF__BUCKET pixels / 8, or the last of those that are processed
-    // together with it. Returns the entry to continue with, or tile->count when done. step_count: of gsf__step or
-    // gsf__wide_step
+    // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry
+    // that brings the kept steps above GSF__BUCKET pixels / 8, or the last of those that are processed together with it.
+    // Returns the entry to continue with, or tile->count when done. step_count: of gsf__step or gsf__wide_step
     size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
                    size_t* step_count);
     // Goes back to front over kept steps and writes the sums of the gradient moments of each entry to its slot (12
@@ -8678,8 +8677,8 @@ GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__tile* tile, const gsf__recor
         const __m256 dy = _mm256_sub_ps(row, _mm256_set1_ps(v));
         const __m256 half2 = _mm256_fnmadd_ps(_mm256_mul_ps(h1, dy), dy, h0);
         const __m256 c = _mm256_fmadd_ps(kx, dy, _mm256_set1_ps(u));
-        _mm256_store_ps(center + 8 * k, c);
-        _mm256_store_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
+        _mm256_storeu_ps(center + 8 * k, c);
+        _mm256_storeu_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
         const __m256 wide = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
         const __m256 half = _mm256_blendv_ps(_mm256_set1_ps(-1e30f), wide, _mm256_cmp_ps(half2, zero, _CMP_GE_OQ));
         left[k] = _mm256_sub_ps(c, half);
@@ -8768,8 +8767,8 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
             if (!left) continue;
             float *r = state->r + 8 * s, *g = state->g + 8 * s, *b = state->b + 8 * s, *z = state->z + 8 * s;
             const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
-            __m256 last = _mm256_load_ps(state->T + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps());
-            __m256 red = _mm256_load_ps(r), green = _mm256_load_ps(g), blue = _mm256_load_ps(b), depth = _mm256_load_ps(z);
+            __m256 last = _mm256_loadu_ps(state->T + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps());
+            __m256 red = _mm256_loadu_ps(r), green = _mm256_loadu_ps(g), blue = _mm256_loadu_ps(b), depth = _mm256_loadu_ps(z);
             __m256 shown;
             do {
                 const size_t at = (size_t)gsf__lowest_bit(left);
@@ -8789,11 +8788,11 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
             } while (left);
             if (!_mm256_movemask_ps(shown)) live &= ~(1u << s);
             const __m256 finished = _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f));
-            _mm256_store_ps(state->T + 8 * s, _mm256_or_ps(last, finished));
-            _mm256_store_ps(r, red);
-            _mm256_store_ps(g, green);
-            _mm256_store_ps(b, blue);
-            if (with_depth) _mm256_store_ps(z, depth);
+            _mm256_storeu_ps(state->T + 8 * s, _mm256_or_ps(last, finished));
+            _mm256_storeu_ps(r, red);
+            _mm256_storeu_ps(g, green);
+            _mm256_storeu_ps(b, blue);
+            if (with_depth) _mm256_storeu_ps(z, depth);
         }
     }
 }
@@ -8815,8 +8814,8 @@ GSF__INLINE_AVX512 uint32_t gsf__rows_avx512(const gsf__tile* tile, const gsf__r
     const __m512 half2 = _mm512_fnmadd_ps(_mm512_mul_ps(_mm512_set1_ps(rec->h1), dy), dy, _mm512_set1_ps(rec->h0));
     const __m512 c = _mm512_fmadd_ps(_mm512_set1_ps(rec->kx), dy, _mm512_set1_ps(u));
     const __m512 yy = _mm512_mul_ps(_mm512_set1_ps(rec->yy), dy);
-    _mm512_store_ps(center, c);
-    _mm512_store_ps(exponent, _mm512_fmadd_ps(yy, dy, _mm512_set1_ps(rec->log2_opacity)));
+    _mm512_storeu_ps(center, c);
+    _mm512_storeu_ps(exponent, _mm512_fmadd_ps(yy, dy, _mm512_set1_ps(rec->log2_opacity)));
     const __m512 wide = _mm512_add_ps(_mm512_sqrt_ps(_mm512_max_ps(half2, zero)), _mm512_set1_ps(0.02f));
     const __m512 half = _mm512_mask_blend_ps(_mm512_cmp_ps_mask(half2, zero, _CMP_GE_OQ), _mm512_set1_ps(-1e30f), wide);
     __m512 from = _mm512_sub_ps(c, half), to = _mm512_add_ps(c, half); // then the union over the rows of a block
@@ -8840,8 +8839,8 @@ GSF__INLINE_AVX512 void gsf__find_avx512(const gsf__tile* tile, size_t first, si
 // As gsf__alpha_avx2, in a block of these columns and of four rows from `row` on.
 GSF__INLINE_AVX512 __m512 gsf__alpha_avx512(const gsf__entries* entries, size_t at, __m512 columns, size_t row) {
     const __m512i spread = _mm512_setr_epi32(0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3);
-    const __m512 center = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_load_ps(entries->center[at] + row)), spread);
-    const __m512 exponent = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_load_ps(entries->exponent[at] + row)), spread);
+    const __m512 center = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_loadu_ps(entries->center[at] + row)), spread);
+    const __m512 exponent = _mm512_permutevar_ps(_mm512_broadcast_f32x4(_mm_loadu_ps(entries->exponent[at] + row)), spread);
     const __m512 e = _mm512_sub_ps(columns, center);
     const __m512 x = _mm512_fmadd_ps(_mm512_mul_ps(_mm512_set1_ps(entries->rec[at]->ee), e), e, exponent);
     const __mmask16 seen = _mm512_cmp_ps_mask(x, _mm512_set1_ps(GSF__LOG2_ALPHA_MIN), _CMP_GE_OQ);
@@ -8882,8 +8881,8 @@ GSF__INLINE_AVX512 void gsf__blend_avx512_body(const gsf__tile* tile, gsf__tile_
             float *r = state->r + 16 * block, *g = state->g + 16 * block, *b = state->b + 16 * block;
             float* z = state->z + 16 * block;
             const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
-            __m512 last = _mm512_load_ps(state->T + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
-            __m512 red = _mm512_load_ps(r), green = _mm512_load_ps(g), blue = _mm512_load_ps(b), depth = _mm512_load_ps(z);
+            __m512 last = _mm512_loadu_ps(state->T + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
+            __m512 red = _mm512_loadu_ps(r), green = _mm512_loadu_ps(g), blue = _mm512_loadu_ps(b), depth = _mm512_loadu_ps(z);
             __mmask16 shown;
             do {
                 const size_t at = (size_t)gsf__lowest_bit(left);
@@ -8902,11 +8901,11 @@ GSF__INLINE_AVX512 void gsf__blend_avx512_body(const gsf__tile* tile, gsf__tile_
                 left &= left - 1;
             } while (left);
             if (!shown) live &= ~(1u << number);
-            _mm512_store_ps(state->T + 16 * block, _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f)));
-            _mm512_store_ps(r, red);
-            _mm512_store_ps(g, green);
-            _mm512_store_ps(b, blue);
-            if (with_depth) _mm512_store_ps(z, depth);
+            _mm512_storeu_ps(state->T + 16 * block, _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f)));
+            _mm512_storeu_ps(r, red);
+            _mm512_storeu_ps(g, green);
+            _mm512_storeu_ps(b, blue);
+            if (with_depth) _mm512_storeu_ps(z, depth);
         }
     }
 }
@@ -9178,7 +9177,7 @@ GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, siz
             const uint32_t s = (uint32_t)gsf__lowest_bit(m);
             const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
             batch->items[count] = (uint32_t)at << 8 | s;
-            _mm256_store_ps(batch->raw + 8 * count, gsf__alpha_avx2(&batch->entries, at, columns, 2 * (s & 7)));
+            _mm256_storeu_ps(batch->raw + 8 * count, gsf__alpha_avx2(&batch->entries, at, columns, 2 * (s & 7)));
         }
     return count;
 }
@@ -9186,9 +9185,9 @@ GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, siz
 // Blends alphas (after the clamp) into T. Finished pixels keep theirs, which is negative. Returns where the splat is
 // blended. Without branches, because it is hard to predict when a pixel finishes.
 GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 alpha, float* memory) {
-    const __m256 T = _mm256_load_ps(memory), open = _mm256_max_ps(T, _mm256_setzero_ps());
+    const __m256 T = _mm256_loadu_ps(memory), open = _mm256_max_ps(T, _mm256_setzero_ps());
     const __m256 next = _mm256_fnmadd_ps(open, alpha, T), shown = _mm256_cmp_ps(next, _mm256_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    _mm256_store_ps(memory, _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, shown));
+    _mm256_storeu_ps(memory, _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, shown));
     return shown;
 }
 
@@ -9202,8 +9201,8 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T, s
         const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
         for (size_t k = 0; k < count; k++) {
             const uint32_t s = batch.items[k] & 255u;
-            const __m256 raw = _mm256_load_ps(batch.raw + 8 * k);
-            _mm256_storeu_ps(steps[kept].T, _mm256_load_ps(T + 8 * s));
+            const __m256 raw = _mm256_loadu_ps(batch.raw + 8 * k);
+            _mm256_storeu_ps(steps[kept].T, _mm256_loadu_ps(T + 8 * s));
             const __m256 shown = gsf__next_avx2(_mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T + 8 * s);
             const __m256 alpha = _mm256_and_ps(shown, raw);
             _mm256_storeu_ps(steps[kept].alpha, alpha);
@@ -9231,7 +9230,7 @@ GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first,
     for (size_t k = 0; k < count; k++) {
         const size_t block = batch->items[k] & 255u;
         const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
-        _mm512_store_ps(batch->raw + 16 * k,
+        _mm512_storeu_ps(batch->raw + 16 * k,
                         gsf__alpha_avx512(&batch->entries, batch->items[k] >> 8, columns, 4 * (block & 3)));
     }
     return count;
@@ -9239,10 +9238,10 @@ GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first,
 
 // As gsf__next_avx2.
 GSF__INLINE_AVX512 __mmask16 gsf__next_avx512(__m512 alpha, float* memory) {
-    const __m512 T = _mm512_load_ps(memory), open = _mm512_max_ps(T, _mm512_setzero_ps());
+    const __m512 T = _mm512_loadu_ps(memory), open = _mm512_max_ps(T, _mm512_setzero_ps());
     const __m512 next = _mm512_fnmadd_ps(open, alpha, T);
     const __mmask16 shown = _mm512_cmp_ps_mask(next, _mm512_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    _mm512_store_ps(memory, _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), shown, next));
+    _mm512_storeu_ps(memory, _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), shown, next));
     return shown;
 }
 
@@ -9257,8 +9256,8 @@ GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* 
         const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
         for (size_t k = 0; k < count; k++) {
             const uint32_t block = batch.items[k] & 255u;
-            const __m512 raw = _mm512_load_ps(batch.raw + 16 * k);
-            _mm512_storeu_ps(steps[kept].T, _mm512_load_ps(T + 16 * block));
+            const __m512 raw = _mm512_loadu_ps(batch.raw + 16 * k);
+            _mm512_storeu_ps(steps[kept].T, _mm512_loadu_ps(T + 16 * block));
             const __mmask16 shown = gsf__next_avx512(_mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T + 16 * block);
             _mm512_storeu_ps(steps[kept].alpha, _mm512_maskz_mov_ps(shown, raw));
             heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
