@@ -19,8 +19,7 @@ export OMP_WAIT_POLICY=passive # spinning workers would take CPU time from each 
 
 cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
 rm -f "$build.cmake.log"
-cmake --build "$build" -j "$(nproc)" --target bench_splat bench_nn bench_metrics make_model test_stress \
-    golden_metrics golden_metricnets > /dev/null
+cmake --build "$build" -j "$(nproc)" --target bench_programs > /dev/null
 temporary=$(mktemp -d)
 trap 'rm -rf "$temporary"' EXIT
 rows=$temporary/rows
