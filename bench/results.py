@@ -7,7 +7,8 @@ Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a tra
 (how run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows
 with the same case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of
 test_stress --json go to the table of worst errors, rows of peers_nn.py and peers_metrics.py with a peer as variant to the
-ratios, errors that the golden tests note (GSF_TEST_ERRORS) to the table of the metrics. Needs only the standard library.
+ratios, errors that the golden tests note (GSF_TEST_ERRORS) to the table of the metrics. Benches of which ROWS.jsonl has no
+row keep those that DIR/results.csv has. Needs only the standard library.
 """
 import collections
 import csv
@@ -19,7 +20,8 @@ import sys
 
 COLUMNS = ["bench", "case", "variant", "isa", "threads", "seconds", "cpu_seconds", "work", "work_unit", "rate",
            "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio",
-           "cpu_ratio", "peer"]
+           "cpu_ratio", "peer", "rounds", "measured"]
+TEXTS = ("bench", "case", "variant", "isa", "work_unit", "reference", "peer", "measured")
 STAGES = ["project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"]
 COLORS = ["#8896ab", "#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#bbbbbb"]
 
@@ -44,6 +46,20 @@ def machine():
 def version():
     with open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "gsfixer.h")) as file:
         return next(line.split('"')[1] for line in file if line.startswith("#define GSF_VERSION "))
+
+
+def measured():  # of which version the new rows are, and where they were measured
+    return "version %s on %s" % (version(), machine())
+
+
+def kept_rows(path, benches):  # those of an earlier run, except of these benches
+    try:
+        with open(path, newline="") as file:
+            old = list(csv.DictReader(file))
+    except OSError:
+        return []
+    return [{key: value if key in TEXTS else int(value) if value.isdigit() else float(value) for key, value in row.items() if value}
+            for row in old if row["bench"] not in benches]
 
 
 def medians(rows):
@@ -309,7 +325,7 @@ def splat_sections(lines, rows, stress, has_growth):
     if steps:
         lines += ["## Training steps on photos", "",
                   "Render, loss, gradients and Adam with density control off; medians of %d alternating rounds."
-                  % max(r["rounds"] for r in steps), ""]
+                  % max(int(r.get("rounds", 1)) for r in steps), ""]
         table(lines, ["", "threads", "ms", "CPU ms", "peak memory"],
               [["ours, " + r["isa"] if r["variant"] == "default" else r["variant"], str(r["threads"]),
                 "%.4g" % (1e3 * r["seconds"]), "%.4g" % (1e3 * r["cpu_seconds"]),
@@ -411,9 +427,12 @@ def metric_sections(lines, rows, noted):
 
 
 def write_markdown(path, rows, stress, noted, has_growth, has_pipeline):
+    parts = [("splats and images", "splat"), ("networks", "nn"), ("metrics", "metrics")]
+    runs = ["%s: %s" % (name, next(r["measured"] for r in rows if r["bench"] == bench))
+            for name, bench in parts if any(r["bench"] == bench for r in rows)]
     lines = ["# Speed and error", "",
-             "Version %s, measured by `bench/run.sh` on %s. The machine may have run other work at the same time: compare rows "
-             "within one run, not between runs." % (version(), machine()), ""]
+             "Measured by `bench/run.sh`; %s. The machine may have run other work at the same time: compare rows within one "
+             "run, not between runs." % "; ".join(runs), ""]
     splat_sections(lines, [r for r in rows if r["bench"] not in ("nn", "metrics")], stress, has_growth)
     if any(r["bench"] == "nn" for r in rows):
         nn_sections(lines, [r for r in rows if r["bench"] == "nn"], has_pipeline)
@@ -431,7 +450,11 @@ def main():
     if not all_rows:
         sys.exit("results: no rows in " + sys.argv[1])
     rows = medians([row for row in all_rows if "bench" in row])
-    write_csv(os.path.join(sys.argv[2], "results.csv"), rows)
+    for row in rows:
+        row["measured"] = measured()
+    table_path = os.path.join(sys.argv[2], "results.csv")
+    rows += kept_rows(table_path, {row["bench"] for row in rows})
+    write_csv(table_path, rows)
     write_stages(os.path.join(sys.argv[2], "stages.svg"), rows)
     has_growth = write_growth(os.path.join(sys.argv[2], "growth.svg"), rows)
     has_pipeline = write_pipeline(os.path.join(sys.argv[2], "pipeline.svg"), rows)

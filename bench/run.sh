@@ -1,6 +1,8 @@
 #!/usr/bin/env bash
 # bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg, bench/RESULTS.md and, unless
-# --quick is given, the speed table in README.md. Optional measurements, by environment variable:
+# --quick is given, the speed table in README.md. By environment variable:
+#   BENCHES="splat nn metrics"  which benches to run; the rows of the others stay as they are
+#   optional measurements:
 #   SCENE=COLMAP_FOLDER         training steps on its photos
 #   START=PLY                   these splats instead of the scene's points as the start
 #   OPENSPLAT=/path/opensplat   the same steps with OpenSplat, alternating with ours, and the ratio (needs SCENE)
@@ -23,11 +25,15 @@ cmake --build "$build" -j "$(nproc)" --target bench_programs > /dev/null
 temporary=$(mktemp -d)
 trap 'rm -rf "$temporary"' EXIT
 rows=$temporary/rows
-"$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
-"$build/bench_splat" --json --growth | tee -a "$rows"
-[ ${#quick[@]} -gt 0 ] || "$build/bench_splat" --json --filter "visibility 5M" | tee -a "$rows"
+benches=" ${BENCHES:-splat nn metrics} "
+wanted() { [[ $benches == *" $1 "* ]]; }
+if wanted splat; then
+    "$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
+    "$build/bench_splat" --json --growth | tee -a "$rows"
+    [ ${#quick[@]} -gt 0 ] || "$build/bench_splat" --json --filter "visibility 5M" | tee -a "$rows"
+fi
 "$build/tests/test_stress" --json 2> /dev/null >> "$rows"
-if [ -n "${SCENE:-}" ]; then
+if wanted splat && [ -n "${SCENE:-}" ]; then
     steps=${STEPS:-200}
     for ((round = 0; round < ${ROUNDS:-5}; round++)); do
         "$build/bench_splat" --json --scene "$SCENE" ${START:+--start "$START"} --threads 2 --steps "$steps" | tee -a "$rows"
@@ -35,13 +41,17 @@ if [ -n "${SCENE:-}" ]; then
             tee -a "$rows"
     done
 fi
-if [ -n "${TORCH:-}" ]; then
+if ! wanted nn; then
+    :
+elif [ -n "${TORCH:-}" ]; then
     "$TORCH" bench/peers_nn.py "$build/bench_nn" ${quick[@]+"${quick[@]}"} | tee -a "$rows"
 else
     "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
 fi
 metrics=("$build/bench_metrics" --models "$temporary/metrics" ${quick[@]+"${quick[@]}"}) # 1.3 GB of weights
-if [ -n "${TORCH:-}" ]; then
+if ! wanted metrics; then
+    :
+elif [ -n "${TORCH:-}" ]; then
     "$TORCH" bench/peers_metrics.py "${metrics[@]}" | tee -a "$rows"
 else
     "${metrics[@]}" --json | tee -a "$rows"
@@ -50,13 +60,15 @@ rm -rf "$temporary/metrics"
 for golden in golden_metrics golden_metricnets; do # their errors against double precision
     GSF_TEST_ERRORS=$rows "$build/tests/$golden" > /dev/null
 done
-for dtype in f32 bf16; do
-    "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
-        --parts transformer,vae,scheduler,features > /dev/null
-done
-"$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" --pipeline "$temporary/bf16" |
-    tee -a "$rows"
-[ -z "${MODEL:-}" ] || "$build/bench_nn" --json --filter model --threads 2 --model "$MODEL" | tee -a "$rows"
+if wanted nn; then
+    for dtype in f32 bf16; do
+        "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
+            --parts transformer,vae,scheduler,features > /dev/null
+    done
+    "$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" \
+        --pipeline "$temporary/bf16" | tee -a "$rows"
+    [ -z "${MODEL:-}" ] || "$build/bench_nn" --json --filter model --threads 2 --model "$MODEL" | tee -a "$rows"
+fi
 status=0
 python3 bench/results.py "$rows" bench || status=$?
 [ ${#quick[@]} -gt 0 ] || python3 bench/readme.py
