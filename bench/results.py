@@ -427,9 +427,11 @@ def metric_sections(lines, rows, noted):
 
 
 def write_markdown(path, rows, stress, noted, has_growth, has_pipeline):
-    parts = [("splats and images", "splat"), ("networks", "nn"), ("metrics", "metrics")]
-    runs = ["%s: %s" % (name, next(r["measured"] for r in rows if r["bench"] == bench))
-            for name, bench in parts if any(r["bench"] == bench for r in rows)]
+    runs = collections.OrderedDict()
+    for r in rows:
+        whole = r["case"].startswith(("pipeline: ", "model: "))
+        runs.setdefault("restorations" if whole else {"nn": "networks", "splat": "splats"}.get(r["bench"], r["bench"]), r["measured"])
+    runs = ["%s: %s" % run for run in runs.items()]
     lines = ["# Speed and error", "",
              "Measured by `bench/run.sh`; %s. The machine may have run other work at the same time: compare rows within one "
              "run, not between runs." % "; ".join(runs), ""]
@@ -451,7 +453,7 @@ def main():
         sys.exit("results: no rows in " + sys.argv[1])
     rows = medians([row for row in all_rows if "bench" in row])
     for row in rows:
-        row["measured"] = measured()
+        row.setdefault("measured", measured())
     table_path = os.path.join(sys.argv[2], "results.csv")
     rows += kept_rows(table_path, {row["bench"] for row in rows})
     write_csv(table_path, rows)
