@@ -95,7 +95,7 @@ def stages_of(rows):  # {(size, isa, threads): {stage: row}}
 
 def write_stages(path, rows):
     bars = [(key, stages) for key, stages in stages_of(rows).items() if len(stages) == len(STAGES)]
-    left, width, bar, gap, top = 210, 560, 18, 8, 46
+    left, width, bar, gap, top = 235, 535, 18, 8, 46
     height = top + len(bars) * (bar + gap) + 10
     out = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
            % (left + width + 90, height),
