@@ -7,8 +7,8 @@ Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a tra
 (how run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows
 with the same case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of
 test_stress --json go to the table of worst errors, rows of peers_nn.py and peers_metrics.py with a peer as variant to the
-ratios, errors that the golden tests note (GSF_TEST_ERRORS) to the table of the metrics. Benches of which ROWS.jsonl has no
-row keep those that DIR/results.csv has. Needs only the standard library.
+ratios, errors that the golden tests note (GSF_TEST_ERRORS) to the table of the metrics. Parts (splats,
+networks, restorations, metrics) of which ROWS.jsonl has no row keep those of DIR/results.csv. Needs only the standard library.
 """
 import collections
 import csv
@@ -52,14 +52,20 @@ def measured():  # of which version the new rows are, and where they were measur
     return "version %s on %s" % (version(), machine())
 
 
-def kept_rows(path, benches):  # those of an earlier run, except of these benches
+def part_of(row):  # what is measured, and kept, together
+    if row["case"].startswith(("pipeline: ", "model: ")):
+        return "restorations"
+    return {"splat": "splats", "nn": "networks"}.get(row["bench"], row["bench"])
+
+
+def kept_rows(path, parts):  # those of an earlier run, except of these parts
     try:
         with open(path, newline="") as file:
             old = list(csv.DictReader(file))
     except OSError:
         return []
     return [{key: value if key in TEXTS else int(value) if value.isdigit() else float(value) for key, value in row.items() if value}
-            for row in old if row["bench"] not in benches]
+            for row in old if part_of(row) not in parts]
 
 
 def medians(rows):
@@ -427,11 +433,7 @@ def metric_sections(lines, rows, noted):
 
 
 def write_markdown(path, rows, stress, noted, has_growth, has_pipeline):
-    runs = collections.OrderedDict()
-    for r in rows:
-        whole = r["case"].startswith(("pipeline: ", "model: "))
-        runs.setdefault("restorations" if whole else {"nn": "networks", "splat": "splats"}.get(r["bench"], r["bench"]), r["measured"])
-    runs = ["%s: %s" % run for run in runs.items()]
+    runs = sorted({"%s: %s" % (part_of(r), r["measured"]) for r in rows})
     lines = ["# Speed and error", "",
              "Measured by `bench/run.sh`; %s. The machine may have run other work at the same time: compare rows within one "
              "run, not between runs." % "; ".join(runs), ""]
@@ -453,9 +455,9 @@ def main():
         sys.exit("results: no rows in " + sys.argv[1])
     rows = medians([row for row in all_rows if "bench" in row])
     for row in rows:
-        row.setdefault("measured", measured())
+        row["measured"] = measured()
     table_path = os.path.join(sys.argv[2], "results.csv")
-    rows += kept_rows(table_path, {row["bench"] for row in rows})
+    rows += kept_rows(table_path, {part_of(row) for row in rows})
     write_csv(table_path, rows)
     write_stages(os.path.join(sys.argv[2], "stages.svg"), rows)
     has_growth = write_growth(os.path.join(sys.argv[2], "growth.svg"), rows)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg, bench/RESULTS.md and, unless
 # --quick is given, the speed table in README.md. By environment variable:
-#   BENCHES="splat nn metrics"  which benches to run; the rows of the others stay as they are
+#   PARTS="splats networks restorations metrics"  what to measure; the rows of the other parts stay as they are
 #   optional measurements:
 #   SCENE=COLMAP_FOLDER         training steps on its photos
 #   START=PLY                   these splats instead of the scene's points as the start
@@ -25,15 +25,18 @@ cmake --build "$build" -j "$(nproc)" --target bench_programs > /dev/null
 temporary=$(mktemp -d)
 trap 'rm -rf "$temporary"' EXIT
 rows=$temporary/rows
-benches=" ${BENCHES:-splat nn metrics} "
-wanted() { [[ $benches == *" $1 "* ]]; }
-if wanted splat; then
+parts=" ${PARTS:-splats networks restorations metrics} "
+wanted() { [[ $parts == *" $1 "* ]]; }
+beside() { # PEERS.py BENCH [OPTIONS]: a bench, with its peers if there are any
+    if [ -n "${TORCH:-}" ]; then "$TORCH" "$@"; else "${@:2}" --json; fi | tee -a "$rows"
+}
+if wanted splats; then
     "$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
     "$build/bench_splat" --json --growth | tee -a "$rows"
     [ ${#quick[@]} -gt 0 ] || "$build/bench_splat" --json --filter "visibility 5M" | tee -a "$rows"
 fi
 "$build/tests/test_stress" --json 2> /dev/null >> "$rows"
-if wanted splat && [ -n "${SCENE:-}" ]; then
+if wanted splats && [ -n "${SCENE:-}" ]; then
     steps=${STEPS:-200}
     for ((round = 0; round < ${ROUNDS:-5}; round++)); do
         "$build/bench_splat" --json --scene "$SCENE" ${START:+--start "$START"} --threads 2 --steps "$steps" | tee -a "$rows"
@@ -41,26 +44,17 @@ if wanted splat && [ -n "${SCENE:-}" ]; then
             tee -a "$rows"
     done
 fi
-if ! wanted nn; then
-    :
-elif [ -n "${TORCH:-}" ]; then
-    "$TORCH" bench/peers_nn.py "$build/bench_nn" ${quick[@]+"${quick[@]}"} | tee -a "$rows"
-else
-    "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
+if wanted networks; then
+    beside bench/peers_nn.py "$build/bench_nn" ${quick[@]+"${quick[@]}"}
 fi
-metrics=("$build/bench_metrics" --models "$temporary/metrics" ${quick[@]+"${quick[@]}"}) # 1.3 GB of weights
-if ! wanted metrics; then
-    :
-elif [ -n "${TORCH:-}" ]; then
-    "$TORCH" bench/peers_metrics.py "${metrics[@]}" | tee -a "$rows"
-else
-    "${metrics[@]}" --json | tee -a "$rows"
+if wanted metrics; then # 1.3 GB of weights
+    beside bench/peers_metrics.py "$build/bench_metrics" --models "$temporary/metrics" ${quick[@]+"${quick[@]}"}
 fi
 rm -rf "$temporary/metrics"
 for golden in golden_metrics golden_metricnets; do # their errors against double precision
     GSF_TEST_ERRORS=$rows "$build/tests/$golden" > /dev/null
 done
-if wanted nn; then
+if wanted restorations; then
     for dtype in f32 bf16; do
         "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
             --parts transformer,vae,scheduler,features > /dev/null
