@@ -6166,14 +6166,16 @@ enum {
 };
 
 typedef struct gsf__conv_kernels {
-    // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last
-    // rows repeat the last pixel. Also prefetches GSF__CONV_SHARE k floats from `ahead` on.
-    void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
+    // c = a b, or c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose
+    // last rows repeat the last pixel. Also prefetches GSF__CONV_SHARE k floats from `ahead` on.
+    void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, int add, float* c,
+                     const float* ahead);
     // The same for the first eight columns of b; the others may be left out, and the prefetches.
-    void (*multiply_half)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
+    void (*multiply_half)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, int add, float* c,
+                          const float* ahead);
     // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
-    void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
-                         int64_t c_next, const float* ahead);
+    void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, int add,
+                         float* c, int64_t c_next, const float* ahead);
     // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and squares.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
@@ -6181,7 +6183,7 @@ typedef struct gsf__conv_kernels {
 } gsf__conv_kernels;
 
 // Two pixels by four outputs: eight sums, so that an addition need not wait for the one before.
-static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c,
+static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, int add, float* c,
                                    const float* ahead) {
     (void)ahead;
     for (int64_t m = 0; m < count; m += 2, c += 2 * GSF__CONV_N) {
@@ -6194,7 +6196,10 @@ static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, c
                 y[0] += x0 * w[0], y[1] += x0 * w[1], y[2] += x0 * w[2], y[3] += x0 * w[3];
                 z[0] += x1 * w[0], z[1] += x1 * w[1], z[2] += x1 * w[2], z[3] += x1 * w[3];
             }
-            for (int i = 0; i < 4; i++) c[n + i] += y[i], c[GSF__CONV_N + n + i] += z[i];
+            for (int i = 0; i < 4; i++) {
+                c[n + i] = add ? c[n + i] + y[i] : y[i];
+                c[GSF__CONV_N + n + i] = add ? c[GSF__CONV_N + n + i] + z[i] : z[i];
+            }
         }
     }
 }
@@ -6211,11 +6216,17 @@ static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int ac
 }
 
 #if GSF__X86
-GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _mm256_add_ps(_mm256_loadu_ps(c), v)); }
+GSF__INLINE_AVX2 void gsf__conv_put8(float* c, __m256 v, int add) {
+    _mm256_storeu_ps(c, add ? _mm256_add_ps(_mm256_loadu_ps(c), v) : v);
+}
+
+GSF__INLINE_AVX512 void gsf__conv_put16(float* c, __m512 v, int add) {
+    _mm512_storeu_ps(c, add ? _mm512_add_ps(_mm512_loadu_ps(c), v) : v);
+}
 
 // Six pixels at a time; missing pixels repeat the last one.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
-                                                     float* c, const float* ahead) {
+                                                     int add, float* c, const float* ahead) {
     for (int64_t m = 0; m < count; m += GSF__CONV_M, a += GSF__CONV_M * lda, c += GSF__CONV_M * GSF__CONV_N) {
         const int64_t last = count - m - 1, share = m == 0 ? GSF__CONV_SHARE : 0;
         const float* w = b;
@@ -6236,7 +6247,7 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
             GSF__SIX(GSF_X)
 #undef GSF_X
         }
-#define GSF_X(r) gsf__conv_add8(c + GSF__CONV_N * r, c##r##0), gsf__conv_add8(c + GSF__CONV_N * r + 8, c##r##1);
+#define GSF_X(r) gsf__conv_put8(c + GSF__CONV_N * r, c##r##0, add), gsf__conv_put8(c + GSF__CONV_N * r + 8, c##r##1, add);
         GSF__SIX(GSF_X)
 #undef GSF_X
     }
@@ -6250,10 +6261,10 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
 
 // Ten pixels by the first eight outputs of a panel, all that the last panel of 3 or 24 outputs has.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_half_avx2(const float* a, int64_t lda, int64_t count, const float* b,
-                                                          int64_t k, float* c, const float* ahead) {
+                                                          int64_t k, int add, float* c, const float* ahead) {
     const int64_t pitch = lda * (int64_t)sizeof(float);
     if (count < GSF__CONV_M10) {
-        gsf__conv_multiply_avx2(a, lda, count, b, k, c, ahead);
+        gsf__conv_multiply_avx2(a, lda, count, b, k, add, c, ahead);
         return;
     }
     for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
@@ -6272,7 +6283,39 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_half_avx2(const float* a, int64_
 #undef GSF_X
         }
 #define GSF_X(r, base, times) \
-        if (r >= done) gsf__conv_add8(to + r * GSF__CONV_N, c##r);
+        if (r >= done) gsf__conv_put8(to + r * GSF__CONV_N, c##r, add);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+}
+
+// Ten pixels by a panel.
+GSF__TARGET_AVX512 static void gsf__conv_multiply_avx512(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
+                                                         int add, float* c, const float* ahead) {
+    const int64_t pitch = lda * (int64_t)sizeof(float);
+    if (count < GSF__CONV_M10) {
+        gsf__conv_multiply_avx2(a, lda, count, b, k, add, c, ahead);
+        return;
+    }
+    for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
+        const int64_t done = m + GSF__CONV_M10 > count ? m + GSF__CONV_M10 - count : 0, share = m == 0 ? GSF__CONV_SHARE : 0;
+        const char *a0 = (const char*)(a + (m - done) * lda), *a1 = a0 + pitch, *a5 = a0 + 5 * pitch;
+        float* to = c + (m - done) * GSF__CONV_N;
+        const float* w = b;
+#define GSF_X(r, base, times) __m512 c##r = _mm512_setzero_ps();
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+        for (int64_t i = 0; i < k; i++, w += GSF__CONV_N, a0 += 4, a1 += 4, a5 += 4) {
+            const __m512 w0 = _mm512_loadu_ps(w);
+            _mm_prefetch((const char*)ahead, _MM_HINT_T1);
+            ahead += share;
+#define GSF_X(r, base, times) \
+            c##r = _mm512_fmadd_ps(_mm512_set1_ps(*(const float*)(const void*)(base + times * pitch)), w0, c##r);
+            GSF_ROWS(GSF_X)
+#undef GSF_X
+        }
+#define GSF_X(r, base, times) \
+        if (r >= done) gsf__conv_put16(to + r * GSF__CONV_N, c##r, add);
         GSF_ROWS(GSF_X)
 #undef GSF_X
     }
@@ -6280,12 +6323,12 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_half_avx2(const float* a, int64_
 
 // Ten pixels by two panels: 20 registers of sums.
 GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
-                                                             int64_t b_next, int64_t k, float* c, int64_t c_next,
-                                                             const float* ahead) {
+                                                             int64_t b_next, int64_t k, int add, float* c,
+                                                             int64_t c_next, const float* ahead) {
     const int64_t pitch = lda * (int64_t)sizeof(float);
     if (count < GSF__CONV_M10) {
-        gsf__conv_multiply_avx2(a, lda, count, b, k, c, ahead);
-        gsf__conv_multiply_avx2(a, lda, count, b + b_next, k, c + c_next, ahead + b_next);
+        gsf__conv_multiply_avx2(a, lda, count, b, k, add, c, ahead);
+        gsf__conv_multiply_avx2(a, lda, count, b + b_next, k, add, c + c_next, ahead + b_next);
         return;
     }
     for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
@@ -6309,11 +6352,8 @@ GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int
 #undef GSF_X
         }
         float *to = c + (m - done) * GSF__CONV_N, *next = to + c_next;
-#define GSF_X(r, base, times)                                                                              \
-        if (r >= done) {                                                                                   \
-            _mm512_storeu_ps(to + r * GSF__CONV_N, _mm512_loadu_ps(to + r * GSF__CONV_N) + c##r);          \
-            _mm512_storeu_ps(next + r * GSF__CONV_N, _mm512_loadu_ps(next + r * GSF__CONV_N) + d##r);      \
-        }
+#define GSF_X(r, base, times)                                                                                              \
+        if (r >= done) gsf__conv_put16(to + r * GSF__CONV_N, c##r, add), gsf__conv_put16(next + r * GSF__CONV_N, d##r, add);
         GSF_ROWS(GSF_X)
 #undef GSF_X
     }
@@ -6356,7 +6396,7 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
     static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, gsf__conv_multiply_half_avx2, NULL, gsf__conv_store_avx2,
                                            gsf__norm_silu_avx2};
-    static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_half_avx2,
+    static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx512, gsf__conv_multiply_half_avx2,
                                              gsf__conv_multiply_two_avx512, gsf__conv_store_avx2, gsf__norm_silu_avx512};
     if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
@@ -6365,10 +6405,107 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
     return &scalar;
 }
 
+// ---- convolution: kernels of Winograd's
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_NN
+
+// The factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next).
+GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
+    for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
+        const size_t left = (size_t)(c - i);
+#define GSF_X(j)                                                                                          \
+        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left);                                \
+        const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, left);                                \
+        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left);                                \
+        const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, left);                                \
+        const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+#define GSF_X(k)                                                             \
+        gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
+        gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
+        gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
+        gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+    }
+}
+
+// 2 x 2 pixels of n outputs for each of `count` tiles, from their products m (16, next), `pitch` apart, and the bias.
+// y (count, 4): where the outputs are, or are added to; NULL for a pixel beyond the border. sums (2, pitch) += values and
+// squares; may be NULL.
+GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, int64_t pitch, int64_t count, const float* bias,
+                                                int64_t n, float* const* y, int accumulate, double* sums) {
+    for (int64_t i = 0; i < n; i += GSF__LANES) {
+        const size_t left = (size_t)(n - i);
+        const gsf__vf b = gsf__v_load_first(bias + i, left);
+        gsf__vd sum[GSF__HALVES], square[GSF__HALVES];
+        for (int h = 0; h < GSF__HALVES; h++) sum[h] = square[h] = gsf__vd_set(0.0);
+        for (int64_t t = 0; t < count; t++) {
+            const float* from = m + t * pitch + i;
+            float* const* to = y + 4 * t;
+#define GSF_X(k)                                                                                                \
+            const gsf__vf p##k = gsf__v_load(from + k * next), q##k = gsf__v_load(from + (k + 4) * next);        \
+            const gsf__vf r##k = gsf__v_load(from + (k + 8) * next), s##k = gsf__v_load(from + (k + 12) * next); \
+            const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
+            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+#define GSF_X(k, value)                                                            \
+            if (to[k]) {                                                           \
+                gsf__vf v = (value) + b;                                           \
+                if (accumulate) v = gsf__v_load_first(to[k] + i, left) + v;        \
+                gsf__v_store_first(to[k] + i, v, left);                            \
+                for (int h = 0; sums && h < GSF__HALVES; h++) {                    \
+                    const gsf__vd d = gsf__vd_half(v, h);                          \
+                    sum[h] = sum[h] + d;                                           \
+                    square[h] = gsf__vd_madd(d, d, square[h]);                     \
+                }                                                                  \
+            }
+            GSF_X(0, (t0 + t1) + t2) GSF_X(1, (t1 - t2) - t3) GSF_X(2, (u0 + u1) + u2) GSF_X(3, (u1 - u2) - u3)
+#undef GSF_X
+        }
+        if (!sums) continue;
+        double a[GSF__LANES], q[GSF__LANES];
+        memcpy(a, sum, sizeof a);
+        memcpy(q, square, sizeof q);
+        for (int k = 0; k < GSF__LANES && (size_t)k < left; k++) {
+            sums[i + k] += a[k];
+            sums[pitch + i + k] += q[k];
+        }
+    }
+}
+
+#endif // GSF__KERNELS_NN
+#ifndef GSF__ISA
+
+// ---- convolution: weights
+
 typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel); 2D: without kt
     const gsf_nn_tensor *weight, *bias;
     int64_t in, out, kt, kernel;
+    int32_t winograd;            // see below
 } gsf__conv_layer;
+
+/* A convolution by 3 x 3 at stride 1 takes 4 instead of 9 products per value, input and output channel by Winograd's
+   F(2 x 2, 3 x 3) (Lavin and Gray 2016): with d, a tile of 4 x 4 pixels whose corners are 2 apart, and g, the kernel,
+
+       2 x 2 outputs = A' ((G g G') * (B' d B)) A      G = 1   0   0     B' = 1  0 -1  0     A' = 1  1  1  0
+                                                           .5  .5 .5          0  1  1  0          0  1 -1 -1
+                                                           .5 -.5 .5          0 -1  1  0
+                                                           0   0   1          0  1  0 -1
+   where * multiplies point by point and adds up over input channels. Each of the 16 points is a matrix product of its own,
+   tiles by channels by outputs. Work is divided into segments of up to 240 tiles, which hold all factors and products of
+   their tiles: weights, (frame of the kernel, 16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so
+   that rounding errors stay those of a sum of products. */
+enum { GSF__WINOGRAD_POINTS = 16,
+       GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // tiles of a segment: least, most; multiples of M and M10
+       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that more than the least number of tiles may take
+
+// Where it pays: with few channels the sums of the tiles take longer than the products that they save.
+static int32_t gsf__conv_suits_winograd(const gsf__conv_layer* layer) {
+    return layer->kernel == 3 && layer->in >= 16 && layer->out >= 16;
+}
 
 static int64_t gsf__conv_taps(const gsf__conv_layer* layer) { return layer->kt * layer->kernel * layer->kernel; }
 static int64_t gsf__conv_blocks(const gsf__conv_layer* layer) { return (layer->out + GSF__CONV_N - 1) / GSF__CONV_N; }
@@ -6376,7 +6513,8 @@ static int64_t gsf__conv_blocks(const gsf__conv_layer* layer) { return (layer->o
 static int64_t gsf__conv_panel(const gsf__conv_layer* layer) {
     return GSF__CONV_N * (1 + gsf__conv_taps(layer) * layer->in);
 }
-static int64_t gsf__conv_packed(const gsf__conv_layer* layer) {
+static int64_t gsf__conv_packed(const gsf__conv_layer* layer) { // by Winograd: all biases, then all weights
+    if (layer->winograd) return gsf__conv_blocks(layer) * GSF__CONV_N * (1 + layer->kt * GSF__WINOGRAD_POINTS * layer->in);
     return gsf__conv_blocks(layer) * gsf__conv_panel(layer);
 }
 
@@ -6410,9 +6548,53 @@ static void gsf__conv_pack_block(void* arg, size_t block, int32_t worker) {
     }
 }
 
+// Sixteen outputs for Winograd: G g G' of every 3 x 3 kernel g, a row of sixteen outputs at a time.
+static void gsf__winograd_pack_block(void* arg, size_t block, int32_t worker) {
+    enum { CHANNELS = 4 };
+    const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
+    const gsf__conv_layer* layer = job->layer;
+    const int64_t taps = gsf__conv_taps(layer), first = (int64_t)block * GSF__CONV_N;
+    const int64_t n_end = gsf__least(layer->out - first, GSF__CONV_N), panel = GSF__CONV_N * layer->in;
+    const int64_t blocks = gsf__conv_blocks(layer);
+    float *bias = job->out + first, *weights = job->out + blocks * GSF__CONV_N + (int64_t)block * panel;
+    float values[(int)CHANNELS * 27], g[(int)CHANNELS * 27][GSF__CONV_N];
+    (void)worker;
+    memset(bias, 0, GSF__CONV_N * sizeof(float));
+    memset(g, 0, sizeof g);
+    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, bias);
+    for (int64_t c0 = 0; c0 < layer->in; c0 += CHANNELS) {
+        const int64_t channels = gsf__least(layer->in - c0, CHANNELS);
+        for (int64_t n = 0; n < n_end; n++) {
+            gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c0) * taps, channels * taps, values);
+            for (int64_t i = 0; i < channels * taps; i++) g[i][n] = values[i];
+        }
+        for (int64_t i = 0; i < channels * layer->kt; i++) { // a 3 x 3 kernel
+            float* to = weights + i % layer->kt * GSF__WINOGRAD_POINTS * blocks * panel + (c0 + i / layer->kt) * GSF__CONV_N;
+            float rows[12][GSF__CONV_N]; // G g
+            for (int x = 0; x < 3; x++)
+                for (int n = 0; n < GSF__CONV_N; n++) {
+                    const float a = g[i * 9 + x][n], b = g[i * 9 + 3 + x][n], c = g[i * 9 + 6 + x][n];
+                    rows[x][n] = a;
+                    rows[3 + x][n] = 0.5f * ((a + c) + b);
+                    rows[6 + x][n] = 0.5f * ((a + c) - b);
+                    rows[9 + x][n] = c;
+                }
+            for (int y = 0; y < 4; y++, to += 4 * blocks * panel)
+                for (int n = 0; n < GSF__CONV_N; n++) {
+                    const float a = rows[3 * y][n], b = rows[3 * y + 1][n], c = rows[3 * y + 2][n];
+                    to[n] = a;
+                    to[blocks * panel + n] = 0.5f * ((a + c) + b);
+                    to[2 * blocks * panel + n] = 0.5f * ((a + c) - b);
+                    to[3 * blocks * panel + n] = c;
+                }
+        }
+    }
+}
+
 static void gsf__conv_pack(gsf_context* ctx, const gsf__conv_layer* layer, float* out) {
     gsf__conv_pack_job job = {layer, out};
-    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), gsf__conv_pack_block, &job);
+    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), layer->winograd ? gsf__winograd_pack_block : gsf__conv_pack_block,
+                      &job);
 }
 
 // A 3 x 3 convolution of a frame upscaled 2x by nearest neighbour equals four 2 x 2 convolutions of the frame itself,
@@ -6422,6 +6604,7 @@ static void gsf__conv_pack(gsf_context* ctx, const gsf__conv_layer* layer, float
 static gsf__conv_layer gsf__conv_quarter(const gsf__conv_layer* layer) { // the convolution for one parity
     gsf__conv_layer quarter = *layer;
     quarter.kernel = 2;
+    quarter.winograd = 0;
     return quarter;
 }
 
@@ -6453,9 +6636,12 @@ static void gsf__conv_pack_quarters(gsf_context* ctx, const gsf__conv_layer* lay
     gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer) * 4, gsf__conv_pack_quarter, &job);
 }
 
-typedef struct gsf__conv_job { // one frame of output
+// ---- convolution: a frame
+
+typedef struct gsf__conv_job { // one frame of output, or more of a 2D convolution
     const gsf__conv_kernels* kernels;
     const float* in[3];              // kt input frames, oldest first
+    int64_t frames, in_frame, out_frame; // how many, and floats from one to the next
     int64_t in_height, in_stride;    // rows and floats per row of an input frame
     int64_t origin, step;            // floats from a row's start to the input of output column 0; between columns
     int64_t kt, kh, k;               // kt x kh kernel rows of k values
@@ -6468,19 +6654,40 @@ typedef struct gsf__conv_job { // one frame of output
     int32_t accumulate;
     int64_t groups;                  // of outputs
     double* partial;                 // (segments, groups, 2): sums and sums of squares; may be NULL
+    int64_t tiles;                   // of Winograd's: tiles of a segment; 0: not by Winograd
+    int64_t inputs;                  // channels
+    void (*spread)(const float* const rows[4], int64_t c, float* v, int64_t next);
+    void (*gather)(const float* m, int64_t next, int64_t pitch, int64_t count, const float* bias, int64_t n, float* const* y,
+                   int accumulate, double* sums);
+    float* room;                     // gsf__conv_room floats
 } gsf__conv_job;
 
 static int64_t gsf__conv_columns(const gsf__conv_job* job) {
     return (job->width + GSF__CONV_COLUMNS - 1) / GSF__CONV_COLUMNS;
 }
-static int64_t gsf__conv_segments(const gsf__conv_job* job) {
+static int64_t gsf__conv_tiles(const gsf__conv_job* job) { // of a frame
+    return (job->height + 1) / 2 * ((job->width + 1) / 2);
+}
+static int64_t gsf__conv_frame_segments(const gsf__conv_job* job) {
     return (job->height + GSF__CONV_ROWS - 1) / GSF__CONV_ROWS * gsf__conv_columns(job);
+}
+static int64_t gsf__conv_segments(const gsf__conv_job* job) {
+    if (job->tiles) return gsf__ceil_div(job->frames * gsf__conv_tiles(job), job->tiles);
+    return job->frames * gsf__conv_frame_segments(job);
+}
+// Floats of a worker: the pixels of a tile, factors (16, tiles, in), products (16, panels, tiles, 16)
+static int64_t gsf__winograd_room(const gsf__conv_job* job) {
+    const int64_t sums = gsf__ceil_div(job->outputs, GSF__CONV_N) * GSF__CONV_N;
+    return job->tiles ? GSF__WINOGRAD_POINTS * (job->inputs + job->tiles * (job->inputs + sums)) : 0;
+}
+static int64_t gsf__conv_room(const gsf_context* ctx, const gsf__conv_job* job) {
+    return ctx->parallel.worker_count * gsf__winograd_room(job);
 }
 
 enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
 
 // Rows of a segment: pixels (y0 + first ...) x (x0 ...).
-typedef struct gsf__conv_band { int64_t y0, first, rows, x0, columns; } gsf__conv_band;
+typedef struct gsf__conv_band { int64_t frame, y0, first, rows, x0, columns; } gsf__conv_band;
 
 // tiles (panels, rows, 30, 16), `next` floats apart, += the products of all kernel rows with one or two panels, which are to
 // give `outputs`.
@@ -6494,12 +6701,13 @@ static void gsf__conv_sum(const gsf__conv_job* job, const gsf__conv_band* band, 
                 for (int64_t r = 0; r < band->rows; r++) {
                     const int64_t row = band->first + r, y = (band->y0 + row) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
-                    const float* a = job->in[kt] + y * job->in_stride + job->origin + band->x0 * job->step + k0;
+                    const float* a = job->in[kt] + band->frame * job->in_frame + y * job->in_stride + job->origin +
+                                     band->x0 * job->step + k0;
                     const float* ahead = b + (GSF__CONV_N + row * GSF__CONV_SHARE) * k; // the rows share the prefetching
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
-                    if (panels == 2) kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, c, next, ahead);
-                    else if (outputs > GSF__CONV_N / 2) kernels->multiply(a, job->step, band->columns, b, k, c, ahead);
-                    else kernels->multiply_half(a, job->step, band->columns, b, k, c, ahead);
+                    if (panels == 2) kernels->multiply_two(a, job->step, band->columns, b, job->panel, k, 1, c, next, ahead);
+                    else if (outputs > GSF__CONV_N / 2) kernels->multiply(a, job->step, band->columns, b, k, 1, c, ahead);
+                    else kernels->multiply_half(a, job->step, band->columns, b, k, 1, c, ahead);
                 }
                 b += k * GSF__CONV_N;
             }
@@ -6511,15 +6719,26 @@ static void gsf__conv_store(const gsf__conv_job* job, const gsf__conv_band* band
     const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N), y = band->y0 + band->first;
     for (int64_t r = 0; r < band->rows; r++)
         job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, band->columns, n, job->accumulate,
-                            job->out + (y + r) * job->out_row + band->x0 * job->ldo + n0, job->ldo, sums);
+                            job->out + band->frame * job->out_frame + (y + r) * job->out_row + band->x0 * job->ldo + n0,
+                            job->ldo, sums);
+}
+
+// Adds the sums (2, 16) of outputs n0 ... to their groups'.
+static void gsf__conv_add_groups(const gsf__conv_job* job, int64_t n0, const double* sums, double* partial) {
+    const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N), per = job->outputs / job->groups;
+    for (int64_t i = 0; i < n; i++) {
+        double* group = partial + (n0 + i) / per * 2;
+        group[0] += sums[i];
+        group[1] += sums[GSF__CONV_N + i];
+    }
 }
 
 static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
     const gsf__conv_job* job = (const gsf__conv_job*)arg;
-    const int64_t across = gsf__conv_columns(job);
-    const int64_t y0 = (int64_t)segment / across * GSF__CONV_ROWS, x0 = (int64_t)segment % across * GSF__CONV_COLUMNS;
+    const int64_t across = gsf__conv_columns(job), each = gsf__conv_frame_segments(job), at = (int64_t)segment % each;
+    const int64_t y0 = at / across * GSF__CONV_ROWS, x0 = at % across * GSF__CONV_COLUMNS;
     const int64_t rows = gsf__least(job->height - y0, GSF__CONV_ROWS);
-    gsf__conv_band band = {y0, 0, 0, x0, gsf__least(job->width - x0, GSF__CONV_COLUMNS)};
+    gsf__conv_band band = {(int64_t)segment / each, y0, 0, 0, x0, gsf__least(job->width - x0, GSF__CONV_COLUMNS)};
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
     float tiles[GSF__CONV_TILE]; // of one panel, or of half the rows for two: any more is too much for small stacks
     double sums[2][2 * GSF__CONV_N];
@@ -6539,19 +6758,101 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
             for (int64_t p = 0; p < panels; p++)
                 gsf__conv_store(job, &band, tiles + p * next, n0 + p * GSF__CONV_N, sums[p]);
         }
-        const int64_t n = gsf__least(job->outputs - n0, panels * GSF__CONV_N);
-        for (int64_t i = 0; partial && i < n; i++) {
-            const int64_t group = (n0 + i) / (job->outputs / job->groups);
-            partial[2 * group] += sums[i / GSF__CONV_N][i % GSF__CONV_N];
-            partial[2 * group + 1] += sums[i / GSF__CONV_N][GSF__CONV_N + i % GSF__CONV_N];
-        }
+        for (int64_t p = 0; partial && p < panels; p++) gsf__conv_add_groups(job, n0 + p * GSF__CONV_N, sums[p], partial);
     }
 }
 
-// Convolves one frame; if job->partial is not NULL, writes the sums per group to `sums` (groups, 2).
+typedef struct gsf__winograd_place { int64_t frame, y, x; } gsf__winograd_place; // of a tile; y and x in tiles
+
+static gsf__winograd_place gsf__winograd_first(const gsf__conv_job* job, int64_t tile) {
+    const int64_t each = gsf__conv_tiles(job), across = (job->width + 1) / 2;
+    const gsf__winograd_place place = {tile / each, tile % each / across, tile % across};
+    return place;
+}
+
+static void gsf__winograd_next(const gsf__conv_job* job, gsf__winograd_place* place) {
+    if (2 * ++place->x < job->width) return;
+    place->x = 0;
+    if (2 * ++place->y < job->height) return;
+    place->y = 0;
+    place->frame++;
+}
+
+// m = the products of all points of `count` tiles, or m += them
+static void gsf__winograd_multiply(const gsf__conv_job* job, int64_t count, const float* v, const float* weights, int add,
+                                   float* m) {
+    const int64_t blocks = gsf__ceil_div(job->outputs, GSF__CONV_N), panel = job->inputs * GSF__CONV_N;
+    const int64_t sums = job->tiles * GSF__CONV_N;
+    for (int64_t p = 0; p < GSF__WINOGRAD_POINTS; p++, v += job->tiles * job->inputs)
+        for (int64_t block = 0, step; block < blocks; block += step, m += step * sums, weights += step * panel) {
+            step = job->kernels->multiply_two && block + 1 < blocks ? 2 : 1;
+            for (int64_t k0 = 0; k0 < job->inputs; k0 += GSF__CONV_K) {
+                const int64_t k = gsf__least(job->inputs - k0, GSF__CONV_K);
+                const float *b = weights + k0 * GSF__CONV_N, *ahead = b + step * k * GSF__CONV_N;
+                if (step == 2) job->kernels->multiply_two(v + k0, job->inputs, count, b, panel, k, add || k0, m, sums, ahead);
+                else job->kernels->multiply(v + k0, job->inputs, count, b, k, add || k0, m, ahead);
+            }
+        }
+}
+
+// The factors of a tile of input frame kt; patch: room for its pixels, if some are beyond the border.
+static void gsf__winograd_spread_tile(const gsf__conv_job* job, int64_t kt, const gsf__winograd_place* at, float* patch,
+                                      float* v) {
+    const int64_t in = job->inputs, x = 2 * at->x - 1, y = 2 * at->y - 1;
+    const int64_t left = x < 0, columns = gsf__least(job->width - x, 4) - left;
+    const float *from = job->in[kt] + at->frame * job->in_frame + job->origin + in, *rows[4]; // of column 0
+    const int inside = columns == 4 && y >= 0 && y + 4 <= job->height;
+    if (!inside) memset(patch, 0, (size_t)(GSF__WINOGRAD_POINTS * in) * sizeof(float));
+    for (int64_t i = 0; i < 4; i++) {
+        rows[i] = inside ? from + (y + i) * job->in_stride + x * in : patch + 4 * i * in;
+        if (!inside && y + i >= 0 && y + i < job->height)
+            memcpy(patch + (4 * i + left) * in, from + (y + i) * job->in_stride + (x + left) * in,
+                   (size_t)(columns * in) * sizeof(float));
+    }
+    job->spread(rows, in, v, job->tiles * in);
+}
+
+static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
+    const gsf__conv_job* job = (const gsf__conv_job*)arg;
+    const int64_t first = (int64_t)segment * job->tiles, in = job->inputs;
+    const int64_t count = gsf__least(job->frames * gsf__conv_tiles(job) - first, job->tiles);
+    const int64_t blocks = gsf__ceil_div(job->outputs, GSF__CONV_N), next = blocks * job->tiles * GSF__CONV_N;
+    const float *bias = job->packed, *weights = bias + blocks * GSF__CONV_N;
+    double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
+    float *patch = job->room + worker * gsf__winograd_room(job), *v = patch + GSF__WINOGRAD_POINTS * in;
+    float* m = v + GSF__WINOGRAD_POINTS * job->tiles * in;
+    float* pixels[GSF__WINOGRAD_TILES * 4];
+    const gsf__winograd_place start = gsf__winograd_first(job, first);
+    for (int64_t kt = 0; kt < job->kt; kt++) {
+        gsf__winograd_place at = start;
+        for (int64_t t = 0; t < count; t++, gsf__winograd_next(job, &at))
+            gsf__winograd_spread_tile(job, kt, &at, patch, v + t * in);
+        gsf__winograd_multiply(job, count, v, weights + kt * GSF__WINOGRAD_POINTS * blocks * in * GSF__CONV_N, kt > 0, m);
+    }
+    gsf__winograd_place at = start;
+    for (int64_t t = 0; t < count; t++, gsf__winograd_next(job, &at)) {
+        float *y = job->out + at.frame * job->out_frame + 2 * at.y * job->out_row + 2 * at.x * job->ldo, **to = pixels + 4 * t;
+        const int right = 2 * at.x + 1 < job->width, below = 2 * at.y + 1 < job->height;
+        to[0] = y;
+        to[1] = right ? y + job->ldo : NULL;
+        to[2] = below ? y + job->out_row : NULL;
+        to[3] = right && below ? y + job->out_row + job->ldo : NULL;
+    }
+    if (partial) memset(partial, 0, (size_t)job->groups * 2 * sizeof(double));
+    for (int64_t n0 = 0; n0 < job->outputs; n0 += GSF__CONV_N, m += job->tiles * GSF__CONV_N) {
+        const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
+        double sums[2 * GSF__CONV_N] = {0};
+        job->gather(m, next, GSF__CONV_N, count, bias + n0, n, pixels, job->accumulate, partial ? sums : NULL);
+        if (partial) gsf__conv_add_groups(job, n0, sums, partial);
+        for (int64_t i = 0; i < 4 * count; i++)
+            if (pixels[i]) pixels[i] += GSF__CONV_N;
+    }
+}
+
+// Convolves the job's frames; if job->partial is not NULL, writes the sums per group to `sums` (groups, 2).
 static void gsf__conv_frame(gsf_context* ctx, gsf__conv_job* job, double* sums) {
     const int64_t segments = gsf__conv_segments(job);
-    gsf__parallel_for(ctx, (size_t)segments, gsf__conv_segment, job);
+    gsf__parallel_for(ctx, (size_t)segments, job->tiles ? gsf__winograd_segment : gsf__conv_segment, job);
     if (!job->partial || !sums) return;
     memset(sums, 0, (size_t)job->groups * 2 * sizeof(double));
     for (int64_t s = 0; s < segments; s++)
@@ -6607,9 +6908,18 @@ static int64_t gsf__conv_frame_size(int64_t height, int64_t width, int64_t chann
     return height * (width + 2) * channels;
 }
 
-// Initialises the members that frames of one size share: bordered input frames of `in_height` x `in_width`.
-static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* layer, int64_t in_height, int64_t in_width,
-                                     int halve, const float* packed) {
+// How many tiles fit in a segment.
+static int64_t gsf__winograd_tiles(const gsf__conv_layer* layer, int64_t tiles) {
+    const int64_t each = GSF__WINOGRAD_POINTS * (layer->in + gsf__conv_blocks(layer) * GSF__CONV_N);
+    int64_t most = GSF__WINOGRAD_ROOM / each / GSF__WINOGRAD_STEP * GSF__WINOGRAD_STEP;
+    if (most < GSF__WINOGRAD_STEP) most = GSF__WINOGRAD_STEP;
+    return gsf__even_piece(tiles, gsf__least(most, GSF__WINOGRAD_TILES), GSF__WINOGRAD_STEP);
+}
+
+// Initialises the members that frames of one size share: `frames` bordered ones of `in_height` x `in_width` at once. The caller
+// provides `room`.
+static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* layer, int64_t frames, int64_t in_height,
+                                     int64_t in_width, int halve, const float* packed) {
     gsf__conv_job job;
     memset(&job, 0, sizeof job);
     job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
@@ -6626,10 +6936,26 @@ static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* la
     job.panel = gsf__conv_panel(layer);
     job.height = halve ? in_height / 2 : in_height;
     job.width = halve ? in_width / 2 : in_width;
+    job.inputs = layer->in;
     job.outputs = job.ldo = layer->out;
     job.out_row = job.width * job.ldo;
     job.groups = 1;
+    job.frames = frames;
+    job.in_frame = in_height * job.in_stride;
+    job.out_frame = job.height * job.out_row;
+    if (layer->winograd) {
+        job.tiles = gsf__winograd_tiles(layer, frames * gsf__conv_tiles(&job));
+        job.spread = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_spread);
+        job.gather = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_gather);
+    }
     return job;
+}
+
+// For input frames without border, which those by 1 x 1 and Winograd's do not need.
+static void gsf__conv_unborder(gsf__conv_job* job) {
+    job->in_stride -= 2 * job->inputs;
+    job->in_frame = job->in_height * job->in_stride;
+    job->origin -= job->inputs;
 }
 
 static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* desc, gsf__conv_layer* layer) {
@@ -6654,6 +6980,7 @@ static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* des
     layer->in = w->shape[1];
     layer->kt = kt;
     layer->kernel = kernel;
+    layer->winograd = !desc->halve && gsf__conv_suits_winograd(layer);
     if (((double)desc->frames + 3.0) * (double)desc->height * ((double)desc->width + 2.0) *
             (double)(layer->in > layer->out ? layer->in : layer->out) > 1e15)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "convolution: %lld frames of %lld x %lld are too large",
@@ -6661,38 +6988,48 @@ static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* des
     return GSF_OK;
 }
 
-// A convolution; 3D ones are causal in time. `workspace` holds the widened weights and three frames of the input with
-// their borders; if it is NULL, memory is allocated for this call.
+enum { GSF__CONV_AT_ONCE = 1 << 18 }; // floats of frames that are given a border at once, if one has not more
+
+// A convolution; 3D ones are causal in time. `workspace` holds the widened weights and frames of the input with their borders;
+// if it is NULL, memory is allocated for this call.
 GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_conv_desc* desc) {
     gsf__conv_layer layer;
     gsf__nn_workspace own;
     memset(&own, 0, sizeof own);
     GSF__TRY(gsf__check_conv(ctx, desc, &layer));
     const size_t plane = (size_t)desc->height * (size_t)desc->width * (size_t)layer.in;
-    const size_t frame = (size_t)gsf__conv_frame_size(desc->height, desc->width, layer.in);
+    const int64_t frame = gsf__conv_frame_size(desc->height, desc->width, layer.in);
+    const int whole = layer.kt == 1 && (layer.kernel == 1 || layer.winograd); // all frames at once, where they are
+    const int64_t fit = layer.kt == 3 ? 1 : whole ? desc->frames : GSF__CONV_AT_ONCE / frame;
+    const int64_t once = gsf__least(fit < 1 ? 1 : fit, desc->frames);
+    gsf__conv_job job = gsf__conv_begin(ctx, &layer, once, desc->height, desc->width, desc->halve, NULL);
+    const int64_t ring = layer.kt == 3 ? 3 * frame : whole ? 0 : once * frame, packed = gsf__conv_packed(&layer);
     float* memory = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own,
-                                            ((size_t)gsf__conv_packed(&layer) + 3 * frame) * sizeof(float));
+                                            (size_t)(ring + packed + gsf__conv_room(ctx, &job)) * sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    float* packed = memory + 3 * frame;
-    gsf__conv_pack(ctx, &layer, packed);
-    gsf__conv_job job = gsf__conv_begin(ctx, &layer, desc->height, desc->width, desc->halve, packed);
+    gsf__conv_pack(ctx, &layer, memory + ring);
+    job.packed = memory + ring;
+    job.room = memory + ring + packed;
+    job.accumulate = desc->accumulate;
+    if (whole) gsf__conv_unborder(&job);
     gsf__conv_fill fill;
     memset(&fill, 0, sizeof fill);
     fill.kernels = job.kernels;
-    fill.height = desc->height;
     fill.width = desc->width;
     fill.channels = layer.in;
-    job.accumulate = desc->accumulate;
-    for (int64_t t = layer.kt == 3 && desc->before ? -2 : 0; t < desc->frames; t++) {
+    for (int64_t t = layer.kt == 3 && desc->before ? -2 : 0; t < desc->frames; t += job.frames) {
+        job.frames = gsf__least(once, desc->frames - t);
         fill.x = t < 0 ? desc->before + (size_t)(t + 2) * plane : desc->x + (size_t)t * plane;
-        fill.out = memory + (size_t)((t + 3) % 3) * frame;
-        gsf__conv_fill_frame(ctx, &fill);
+        fill.out = layer.kt == 3 ? memory + (t + 3) % 3 * frame : memory;
+        fill.height = job.frames * desc->height;
+        if (!whole) gsf__conv_fill_frame(ctx, &fill);
         if (t < 0) continue;
-        for (int64_t i = 0; i < layer.kt; i++) { // the first frame is repeated before itself
-            const int64_t source = t - layer.kt + 1 + i;
-            job.in[i] = memory + (size_t)(source < 0 && !desc->before ? 0 : (source + 3) % 3) * frame;
+        job.in[0] = whole ? fill.x : memory;
+        for (int64_t i = 0; layer.kt == 3 && i < 3; i++) { // the first frame is repeated before itself
+            const int64_t source = t - 2 + i;
+            job.in[i] = memory + (source < 0 && !desc->before ? 0 : (source + 3) % 3) * frame;
         }
-        job.out = desc->y + t * job.height * job.width * layer.out;
+        job.out = desc->y + t * job.out_frame;
         gsf__conv_frame(ctx, &job, NULL);
     }
     gsf__nn_destroy_workspace(ctx, &own);
@@ -11435,6 +11772,7 @@ static gsf_result gsf__vae_load_conv(gsf__vae_loader* l, const char* name, int64
     layer->out = out;
     layer->kt = kt ? kt : 1;
     layer->kernel = kernel;
+    layer->winograd = kt == 3 && gsf__conv_suits_winograd(layer);
     l->net->causal_count += kt == 3;
     return GSF_OK;
 }
@@ -11632,7 +11970,7 @@ typedef struct gsf__vae_run {
     int dry;
     double flops;
     size_t bytes, peak;
-    gsf__vae_buffer slots[GSF__VAE_SLOTS], spare, packed, table, partial, sums;
+    gsf__vae_buffer slots[GSF__VAE_SLOTS], spare, packed, room, table, partial, sums;
     gsf__vae_cache* caches;  // one per causal layer; with a single chunk all layers share the first
     int32_t cache_at;
     gsf__vae_map z;          // the chunk's latents, for the decoder's spatial norms
@@ -11670,6 +12008,7 @@ static void gsf__vae_end(gsf__vae_run* run) {
     gsf_free(run->ctx, run->caches);
     gsf__vae_release(run->ctx, &run->spare);
     gsf__vae_release(run->ctx, &run->packed);
+    gsf__vae_release(run->ctx, &run->room);
     gsf__vae_release(run->ctx, &run->table);
     gsf__vae_release(run->ctx, &run->partial);
     gsf__vae_release(run->ctx, &run->sums);
@@ -11735,11 +12074,10 @@ static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const
     gsf__vae_blend blend = {table, scale, shift, run->z.width, c};
     for (int i = 0; i < 2; i++) {
         gsf__conv_pack(run->ctx, layers[i], run->packed.data);
-        gsf__conv_job job = gsf__conv_begin(run->ctx, layers[i], run->z.frames * run->z.height, run->z.width, 0,
+        gsf__conv_job job = gsf__conv_begin(run->ctx, layers[i], 1, run->z.frames * run->z.height, run->z.width, 0,
                                             run->packed.data);
         job.in[0] = run->slots[GSF__VAE_INPUT].data;
-        job.in_stride = run->z.width * run->z.channels; // not padded
-        job.origin = 0;
+        gsf__conv_unborder(&job);
         job.out = table + i * c;
         job.ldo = 2 * c;
         job.out_row = run->z.width * job.ldo;
@@ -11809,7 +12147,9 @@ static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer
     GSF__TRY(gsf__check_cancel(run->ctx));
     GSF__TRY(gsf__vae_grow(run, &run->packed, gsf__conv_packed(layer)));
     GSF__TRY(gsf__vae_grow(run, &run->slots[out->slot], out->frames * gsf__vae_plane(out)));
-    *job = gsf__conv_begin(run->ctx, layer, in->height, in->width, halve, run->packed.data);
+    *job = gsf__conv_begin(run->ctx, layer, 1, in->height, in->width, halve, run->packed.data);
+    GSF__TRY(gsf__vae_grow(run, &run->room, gsf__conv_room(run->ctx, job)));
+    job->room = run->room.data;
     job->groups = gsf__vae_groups(run, layer->out);
     GSF__TRY(gsf__vae_grow(run, &run->partial, gsf__conv_segments(job) * job->groups * 2 * 2));
     job->partial = (double*)(void*)run->partial.data;
@@ -11906,8 +12246,7 @@ static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* la
     gsf__vae_count(run, layer, out, out->frames);
     if (run->dry) return GSF_OK;
     gsf__conv_pack(run->ctx, layer, run->packed.data);
-    job.in_stride = in->width * in->channels;
-    job.origin = 0;
+    gsf__conv_unborder(&job);
     job.partial = NULL; // conv2 is added later and computes the sums
     for (int64_t t = 0; t < in->frames; t++) {
         float* y = run->slots[slot].data + t * plane;
@@ -15951,47 +16290,6 @@ GSF__V_KERNEL double GSF__V(gsf__lpips_distance)(const float* a, const float* b,
     return sum;
 }
 
-// For Winograd's convolution (below): the factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next).
-GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
-    for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
-        const size_t left = (size_t)(c - i);
-#define GSF_X(j)                                                                                          \
-        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left);                                \
-        const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, left);                                \
-        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left);                                \
-        const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, left);                                \
-        const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
-#undef GSF_X
-#define GSF_X(k)                                                             \
-        gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
-        gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
-        gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
-        gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
-#undef GSF_X
-    }
-}
-
-// 2 x 2 pixels of n outputs from the products m (16, next) and the bias: y[0..3], NULL for a pixel beyond the border.
-GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, const float* bias, int64_t n,
-                                                float* const y[4]) {
-    for (int64_t i = 0; i < n; i += GSF__LANES, m += GSF__LANES) {
-        const size_t left = (size_t)(n - i);
-        const gsf__vf b = gsf__v_load_first(bias + i, left);
-#define GSF_X(k)                                                                                       \
-        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);        \
-        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next); \
-        const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
-#undef GSF_X
-        gsf__v_store_first(y[0] + i, ((t0 + t1) + t2) + b, left);
-        if (y[1]) gsf__v_store_first(y[1] + i, ((t1 - t2) - t3) + b, left);
-        if (y[2]) gsf__v_store_first(y[2] + i, ((u0 + u1) + u2) + b, left);
-        if (y[3]) gsf__v_store_first(y[3] + i, ((u1 - u2) - u3) + b, left);
-    }
-}
-
 #endif // GSF__KERNELS_NN
 #ifndef GSF__ISA
 
@@ -16085,220 +16383,51 @@ typedef struct gsf__map_conv { // a convolution; kernel and channels are those o
     const void* key;          // of the packed weights
 } gsf__map_conv;
 
-/* A convolution by 3 x 3 at stride 1 takes 4 instead of 9 products per value, input and output channel by Winograd's
-   F(2 x 2, 3 x 3) (Lavin and Gray 2016): with d, a tile of 4 x 4 pixels whose corners are 2 apart, and g, the kernel,
-
-       2 x 2 outputs = A' ((G g G') * (B' d B)) A      G = 1   0   0     B' = 1  0 -1  0     A' = 1  1  1  0
-                                                           .5  .5 .5          0  1  1  0          0  1 -1 -1
-                                                           .5 -.5 .5          0 -1  1  0
-                                                           0   0   1          0  1  0 -1
-   where * multiplies point by point and adds up over input channels. Each of the 16 points is a matrix product of its own,
-   tiles by channels by outputs. Work is divided into segments of up to 240 tiles, which hold all factors and products of
-   their tiles: weights, (16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so that rounding
-   errors stay those of a sum of products. */
-
-enum { GSF__WINOGRAD_POINTS = 16,
-       GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // tiles of a segment: least, most; multiples of M and M10
-       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that more than the least number of tiles may take
-
-static int64_t gsf__winograd_packed(const gsf__conv_layer* layer) { // floats: biases, weights
-    return gsf__conv_blocks(layer) * GSF__CONV_N * (1 + GSF__WINOGRAD_POINTS * layer->in);
-}
-
-static void gsf__winograd_pack_block(void* arg, size_t block, int32_t worker) { // sixteen outputs
-    static const double g[4][3] = {{1.0, 0.0, 0.0}, {0.5, 0.5, 0.5}, {0.5, -0.5, 0.5}, {0.0, 0.0, 1.0}};
-    const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
-    const gsf__conv_layer* layer = job->layer;
-    const int64_t first = (int64_t)block * GSF__CONV_N, n_end = gsf__least(layer->out - first, GSF__CONV_N);
-    const int64_t panel = GSF__CONV_N * layer->in, blocks = gsf__conv_blocks(layer);
-    float *bias = job->out + first, *to = job->out + blocks * GSF__CONV_N + (int64_t)block * panel;
-    (void)worker;
-    memset(bias, 0, GSF__CONV_N * sizeof(float));
-    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, bias);
-    for (int64_t c = 0; c < layer->in; c++)
-        for (int64_t n = 0; n < GSF__CONV_N; n++) {
-            float values[9] = {0};
-            double rows[4][3];
-            if (n < n_end) gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c) * 9, 9, values);
-            for (int i = 0; i < 4; i++)
-                for (int x = 0; x < 3; x++)
-                    rows[i][x] = g[i][0] * (double)values[x] + g[i][1] * (double)values[3 + x] +
-                                 g[i][2] * (double)values[6 + x];
-            for (int p = 0; p < GSF__WINOGRAD_POINTS; p++)
-                to[p * blocks * panel + c * GSF__CONV_N + n] =
-                    (float)(rows[p / 4][0] * g[p % 4][0] + rows[p / 4][1] * g[p % 4][1] + rows[p / 4][2] * g[p % 4][2]);
-        }
-}
-
-typedef struct gsf__winograd_job { // of one image
-    const gsf__conv_kernels* kernels;
-    void (*spread)(const float* const rows[4], int64_t c, float* v, int64_t next);
-    void (*gather)(const float* m, int64_t next, const float* bias, int64_t n, float* const y[4]);
-    const float *x, *zeros;        // the bordered image; four pixels
-    const float *bias, *weights;
-    int64_t in, out, blocks;       // channels; panels of 16 outputs
-    int64_t height, width, across; // across: tiles
-    int64_t tiles, segment;        // of the image; of a segment
-    float* y;
-    int64_t ldo, out_row;
-    float* workers;
-    size_t per_worker;             // floats: factors (16, segment, in), products (16, blocks, segment, 16)
-} gsf__winograd_job;
-
-static void gsf__winograd_multiply(const gsf__winograd_job* job, int64_t count, const float* v, float* m) {
-    const int64_t panel = job->in * GSF__CONV_N, sums = job->segment * GSF__CONV_N;
-    for (int64_t p = 0; p < GSF__WINOGRAD_POINTS; p++, v += job->segment * job->in)
-        for (int64_t block = 0, step; block < job->blocks; block += step, m += step * sums) {
-            const float* b = job->weights + (p * job->blocks + block) * panel;
-            step = job->kernels->multiply_two && block + 1 < job->blocks ? 2 : 1;
-            memset(m, 0, (size_t)(step * sums) * sizeof(float));
-            for (int64_t k0 = 0; k0 < job->in; k0 += GSF__CONV_K) {
-                const int64_t k = gsf__least(job->in - k0, GSF__CONV_K);
-                const float *panels = b + k0 * GSF__CONV_N, *ahead = panels + step * k * GSF__CONV_N;
-                if (step == 2)
-                    job->kernels->multiply_two(v + k0, job->in, count, panels, panel, k, m, sums, ahead);
-                else job->kernels->multiply(v + k0, job->in, count, panels, k, m, ahead);
-            }
-        }
-}
-
-static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
-    const gsf__winograd_job* job = (const gsf__winograd_job*)arg;
-    const int64_t first = (int64_t)segment * job->segment, count = gsf__least(job->tiles - first, job->segment);
-    const int64_t row = (job->width + 2) * job->in, next = job->blocks * job->segment * GSF__CONV_N;
-    float* v = job->workers + (size_t)worker * job->per_worker;
-    float* m = v + GSF__WINOGRAD_POINTS * job->segment * job->in;
-    for (int64_t t = 0; t < count; t++) {
-        const int64_t y = (first + t) / job->across * 2 - 1, x = (first + t) % job->across * 2;
-        const float* rows[4];
-        for (int64_t i = 0; i < 4; i++)
-            rows[i] = y + i < 0 || y + i >= job->height ? job->zeros : job->x + (y + i) * row + x * job->in;
-        job->spread(rows, job->in, v + t * job->in, job->segment * job->in);
-    }
-    gsf__winograd_multiply(job, count, v, m);
-    for (int64_t block = 0; block < job->blocks; block++)
-        for (int64_t t = 0; t < count; t++) {
-            const int64_t y = (first + t) / job->across * 2, x = (first + t) % job->across * 2, n0 = block * GSF__CONV_N;
-            float* to = job->y + y * job->out_row + x * job->ldo + n0;
-            const int right = x + 1 < job->width, below = y + 1 < job->height;
-            float* const pixels[4] = {to, right ? to + job->ldo : NULL, below ? to + job->out_row : NULL,
-                                      right && below ? to + job->out_row + job->ldo : NULL};
-            job->gather(m + (block * job->segment + t) * GSF__CONV_N, next, job->bias + n0,
-                        gsf__least(job->out - n0, GSF__CONV_N), pixels);
-        }
-}
-
-// Tiles of a segment: as many as fit.
-static int64_t gsf__winograd_tiles(const gsf__conv_layer* layer, int64_t tiles) {
-    const int64_t each = GSF__WINOGRAD_POINTS * (layer->in + gsf__conv_blocks(layer) * GSF__CONV_N);
-    int64_t most = GSF__WINOGRAD_ROOM / each / GSF__WINOGRAD_STEP * GSF__WINOGRAD_STEP;
-    if (most < GSF__WINOGRAD_STEP) most = GSF__WINOGRAD_STEP;
-    return gsf__even_piece(tiles, gsf__least(most, GSF__WINOGRAD_TILES), GSF__WINOGRAD_STEP);
-}
-
-// Where it pays: with few channels the sums of the tiles take longer than the products that they save.
-static int gsf__is_winograd(const gsf__map_conv* c, const gsf__conv_layer* layer, const gsf__map* x, const gsf__map* y) {
-    return layer->kernel == 3 && c->stride == 1 && c->pad == 1 && c->above == 1 && c->left == 0 && x->height == y->height &&
-           x->width == y->width && layer->in >= 16 && layer->out >= 16;
-}
-
 static float* gsf__map_find_packed(const gsf__map_layers* layers, const void* key) { // NULL: not packed yet
     for (size_t i = 0; i < layers->count; i++)
         if (layers->packed[i].key == key) return layers->packed[i].packed;
     return NULL;
 }
 
-// The weights of a layer, packed for `winograd` or not; NULL when out of memory.
-static const float* gsf__map_pack(gsf_context* ctx, gsf__map_layers* layers, const gsf__conv_layer* layer, const void* key,
-                                  int winograd) {
-    gsf__conv_pack_job job = {layer, gsf__map_find_packed(layers, key)};
-    if (job.out) return job.out;
-    const size_t count = (size_t)(winograd ? gsf__winograd_packed(layer) : gsf__conv_packed(layer));
+// The packed weights of a layer; NULL when out of memory.
+static const float* gsf__map_pack(gsf_context* ctx, gsf__map_layers* layers, const gsf__conv_layer* layer, const void* key) {
+    float* out = gsf__map_find_packed(layers, key);
+    if (out) return out;
     if (gsf__reserve(ctx, (void**)&layers->packed, &layers->room, layers->count, layers->count + 1, sizeof *layers->packed))
         return NULL;
-    job.out = (float*)gsf_alloc(ctx, count, sizeof(float));
-    if (!job.out) return NULL;
-    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), winograd ? gsf__winograd_pack_block : gsf__conv_pack_block, &job);
+    out = (float*)gsf_alloc(ctx, (size_t)gsf__conv_packed(layer), sizeof(float));
+    if (!out) return NULL;
+    gsf__conv_pack(ctx, layer, out);
     layers->packed[layers->count].key = key;
-    layers->packed[layers->count++].packed = job.out;
-    return job.out;
-}
-
-static void gsf__map_winograd(gsf_context* ctx, const gsf__map_conv* c, const gsf__conv_layer* layer, const float* packed,
-                              gsf__map_fill* fill, float* workers, const gsf__map* y) {
-    gsf__winograd_job job;
-    memset(&job, 0, sizeof job);
-    job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
-    job.spread = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_spread);
-    job.gather = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_gather);
-    job.in = layer->in;
-    job.out = layer->out;
-    job.blocks = gsf__conv_blocks(layer);
-    job.height = y->height;
-    job.width = y->width;
-    job.across = (y->width + 1) / 2;
-    job.tiles = job.across * ((y->height + 1) / 2);
-    job.segment = gsf__winograd_tiles(layer, job.tiles);
-    job.x = fill->out;
-    job.bias = packed;
-    job.weights = packed + job.blocks * GSF__CONV_N;
-    job.ldo = c->ldo;
-    job.out_row = c->out_row;
-    job.workers = workers;
-    job.per_worker = (size_t)(GSF__WINOGRAD_POINTS * job.segment * (job.in + job.blocks * GSF__CONV_N));
-    float* zeros = fill->out + y->height * (y->width + 2) * job.in; // also right of the last row, in a tile cut by the border
-    memset(zeros, 0, (size_t)(4 * job.in) * sizeof(float));
-    job.zeros = zeros;
-    for (; fill->image < fill->x->images; fill->image++) {
-        gsf__parallel_for(ctx, (size_t)y->height, gsf__map_fill_row, fill);
-        job.y = y->data + fill->image * y->height * y->width * y->pitch;
-        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.tiles, job.segment), gsf__winograd_segment, &job);
-    }
+    layers->packed[layers->count++].packed = out;
+    return out;
 }
 
 // Writes y, of the sizes given there; y may be a part of x.
 static gsf_result gsf__map_convolve_at(gsf_context* ctx, gsf__map_layers* layers, const gsf__map_conv* c, const gsf__map* x,
                                        const gsf__map* y) {
     const gsf_nn_tensor* w = c->layer->weight;
-    gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2]};
-    const int64_t across = x->width + 2 * c->pad;
-    const int winograd = gsf__is_winograd(c, &layer, x, y);
-    size_t floats = (size_t)(x->height * across * layer.in);
-    if (winograd) {
-        const int64_t segment = gsf__winograd_tiles(&layer, (y->width + 1) / 2 * ((y->height + 1) / 2));
-        floats += (size_t)(4 * layer.in) + (size_t)ctx->parallel.worker_count * (size_t)(GSF__WINOGRAD_POINTS * segment) *
-                                               (size_t)(layer.in + gsf__conv_blocks(&layer) * GSF__CONV_N);
-    }
-    float* memory = (float*)gsf__nn_scratch(ctx, &layers->scratch, floats * sizeof(float));
-    const float* packed = memory ? gsf__map_pack(ctx, layers, &layer, c->key, winograd) : NULL;
-    if (!packed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2], 0};
+    const int64_t across = x->width + 2 * c->pad, frame = x->height * across * layer.in;
+    layer.winograd = c->stride == 1 && c->pad == 1 && c->above == 1 && c->left == 0 && x->height == y->height &&
+                     x->width == y->width && gsf__conv_suits_winograd(&layer);
+    gsf__conv_job job = gsf__conv_begin(ctx, &layer, 1, y->height, y->width, 0, NULL);
+    float* memory = (float*)gsf__nn_scratch(ctx, &layers->scratch,
+                                            (size_t)(frame + gsf__conv_room(ctx, &job)) * sizeof(float));
+    job.packed = memory ? gsf__map_pack(ctx, layers, &layer, c->key) : NULL;
+    if (!job.packed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__map_fill fill = {x, memory, 0, c->pad, NULL};
     if (c->rectify) fill.rectify = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__map_rectify);
-    if (winograd) {
-        gsf__map_winograd(ctx, c, &layer, packed, &fill, memory + x->height * across * layer.in + 4 * layer.in, y);
-        return GSF_OK;
-    }
-    gsf__conv_job job;
-    memset(&job, 0, sizeof job);
-    job.kernels = gsf__conv_kernels_of(ctx->cpu_level);
     job.in[0] = memory;
+    job.room = memory + frame;
     job.in_height = x->height;
     job.in_stride = across * layer.in;
     job.origin = c->left * layer.in;
     job.step = c->stride * layer.in;
-    job.kt = 1;
-    job.kh = layer.kernel;
-    job.k = layer.kernel * layer.in;
     job.stride = c->stride;
     job.pad = c->above;
-    job.packed = packed;
-    job.panel = gsf__conv_panel(&layer);
-    job.height = y->height;
-    job.width = y->width;
-    job.outputs = layer.out;
     job.ldo = c->ldo;
     job.out_row = c->out_row;
-    job.groups = 1;
     for (; fill.image < x->images; fill.image++) {
         gsf__parallel_for(ctx, (size_t)x->height, gsf__map_fill_row, &fill);
         job.out = y->data + fill.image * y->height * y->width * y->pitch;
@@ -18610,6 +18739,24 @@ GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int
 }
 
 #endif
+// For the gradient of Winograd's weights: A dy A' of 2 x 2 pixels of n outputs, y[0..3], NULL beyond the border: z (16, next).
+GSF__V_KERNEL void GSF__V(gsf__winograd_spread_grad)(const float* const y[4], int64_t n, float* z, int64_t next) {
+    for (int64_t i = 0; i < n; i += GSF__LANES, z += GSF__LANES) {
+        const size_t left = (size_t)(n - i);
+        const gsf__vf none = gsf__v_set(0.0f), a = gsf__v_load_first(y[0] + i, left);
+        const gsf__vf b = y[1] ? gsf__v_load_first(y[1] + i, left) : none;
+        const gsf__vf c = y[2] ? gsf__v_load_first(y[2] + i, left) : none;
+        const gsf__vf d = y[3] ? gsf__v_load_first(y[3] + i, left) : none;
+#define GSF_X(k, p, q)                                                  \
+        gsf__v_store_first(z + (4 * (k)) * next, p, left);               \
+        gsf__v_store_first(z + (4 * (k) + 1) * next, (p) + (q), left);   \
+        gsf__v_store_first(z + (4 * (k) + 2) * next, (p) - (q), left);   \
+        gsf__v_store_first(z + (4 * (k) + 3) * next, none - (q), left);
+        GSF_X(0, a, b) GSF_X(1, a + c, b + d) GSF_X(2, a - c, b - d) GSF_X(3, none - c, none - d)
+#undef GSF_X
+    }
+}
+
 #endif // GSF__KERNELS_GRADIENTS
 #ifndef GSF__ISA
 #ifdef GSF_NN_TRAINING
@@ -19115,6 +19262,7 @@ typedef struct gsf__nn_conv_grad_desc {
     float *dx, *dbefore;       // as x, as before; each may be NULL
     int32_t accumulate;        // dx += instead of dx = ...
     float *dweight, *dbias;    // (out, in, ...), (out), added to; each may be NULL
+    gsf__nn_workspace* workspace; // may be NULL
 } gsf__nn_conv_grad_desc;
 
 /* dx is itself a convolution, of dy by the transposed kernel, upside down and mirrored: forward frames s, s + 1, s + 2
@@ -19127,6 +19275,10 @@ typedef struct gsf__conv_grad_job {
     int64_t height, width;     // of dy
     int64_t bands, band_rows;  // of the rows of all of dy's frames
     float* sums;               // (bands, taps, in, out)
+    gsf__conv_job tiles;       // by Winograd's: of the forward pass
+    int64_t band_tiles, out;   // outputs rounded up to 16
+    void (*spread)(const float* const y[4], int64_t n, float* z, int64_t next);
+    float* dweight;
 } gsf__conv_grad_job;
 
 static int64_t gsf__conv_flip(int64_t tap, int64_t kernel) { // within a frame of the kernel
@@ -19153,16 +19305,37 @@ static void gsf__conv_spread(const float* dy, int64_t height, int64_t width, int
                    (size_t)channels * sizeof(float));
 }
 
+static gsf_result gsf__conv_grad_plain_input(gsf_context* ctx, const gsf__conv_grad_job* g) { // 2D, at stride 1
+    const int64_t shape[4] = {g->layer.in, g->layer.out, g->layer.kernel, g->layer.kernel};
+    float* flipped = (float*)gsf_alloc(ctx, (size_t)g->layer.weight->count, sizeof *flipped);
+    if (!flipped) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_nn_tensor weight = gsf_nn_wrap_tensor(g->layer.weight->name, flipped, 4, shape);
+    gsf__nn_conv_desc d = *g->desc->forward;
+    gsf__conv_flip_weight(&g->layer, flipped);
+    d.x = g->desc->dy;
+    d.y = g->desc->dx;
+    d.weight = &weight;
+    d.bias = NULL;
+    d.accumulate = g->desc->accumulate;
+    const gsf_result result = gsf__nn_convolve(ctx, g->desc->workspace, &d);
+    gsf_free(ctx, flipped);
+    return result;
+}
+
 static gsf_result gsf__conv_grad_input(gsf_context* ctx, const gsf__conv_grad_job* g) {
     const gsf__nn_conv_desc* f = g->desc->forward;
+    if (g->layer.kt == 1 && !f->halve) return gsf__conv_grad_plain_input(ctx, g);
     const int64_t in = g->layer.in, out = g->layer.out, frame = gsf__conv_frame_size(f->height, f->width, out);
     const int64_t plane = f->height * f->width * in, kt = g->layer.kt;
     gsf__conv_layer layer = g->layer;
     layer.in = out;
     layer.out = in;
     layer.bias = NULL;
+    layer.winograd = gsf__conv_suits_winograd(&layer);
+    gsf__conv_job job = gsf__conv_begin(ctx, &layer, 1, f->height, f->width, 0, NULL);
     const size_t taps = (size_t)layer.weight->count, packed = (size_t)gsf__conv_packed(&layer);
-    float* memory = (float*)gsf_alloc_zeroed(ctx, 4 * (size_t)frame + taps + packed, sizeof(float));
+    const size_t room = (size_t)gsf__conv_room(ctx, &job);
+    float* memory = (float*)gsf_alloc_zeroed(ctx, 4 * (size_t)frame + taps + packed + room, sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
     float *flipped = memory + 4 * frame, *weights = flipped + taps; // three frames of dy and one of zeros
     const int64_t shape[5] = {in, out, kt, layer.kernel, layer.kernel};
@@ -19170,7 +19343,8 @@ static gsf_result gsf__conv_grad_input(gsf_context* ctx, const gsf__conv_grad_jo
     gsf__conv_flip_weight(&g->layer, flipped);
     layer.weight = &weight;
     gsf__conv_pack(ctx, &layer, weights);
-    gsf__conv_job job = gsf__conv_begin(ctx, &layer, f->height, f->width, 0, weights);
+    job.packed = weights;
+    job.room = weights + packed;
     gsf__conv_fill fill;
     memset(&fill, 0, sizeof fill);
     fill.kernels = job.kernels;
@@ -19242,6 +19416,93 @@ static void gsf__conv_grad_add(const gsf__conv_grad_job* g, double* sums, float*
             for (int64_t t = 0; t < taps; t++) dweight[(o * in + i) * taps + t] += (float)sums[(t * in + i) * out + o];
 }
 
+/* The gradient of Winograd's weights is G' (sum over tiles of (A dy A') * (B' d B)) G: each of the 16 points is the product of
+   factors, transposed, and gradients, channels by tiles by outputs. A chunk is a band of tiles. */
+static void gsf__winograd_grad_band(void* arg, size_t band, int32_t worker) {
+    const gsf__conv_grad_job* g = (const gsf__conv_grad_job*)arg;
+    const gsf__conv_job* job = &g->tiles;
+    const int64_t in = job->inputs, out = job->outputs, size = in * g->out;
+    const int64_t total = job->frames * gsf__conv_tiles(job), last = gsf__least(((int64_t)band + 1) * g->band_tiles, total);
+    float *patch = job->room + worker * gsf__winograd_room(job), *v = patch + GSF__WINOGRAD_POINTS * in;
+    float *z = v + GSF__WINOGRAD_POINTS * job->tiles * in, *sums = g->sums + (int64_t)band * GSF__WINOGRAD_POINTS * size;
+    gsf__winograd_place at = gsf__winograd_first(job, (int64_t)band * g->band_tiles);
+    gsf__grad_product p;
+    p.a_row = 1;
+    p.a_step = p.rows = in;
+    p.ldb = p.columns = out;
+    p.ldc = g->out;
+    memset(sums, 0, (size_t)(GSF__WINOGRAD_POINTS * size) * sizeof(float));
+    for (int64_t first = (int64_t)band * g->band_tiles; first < last; first += job->tiles) {
+        p.count = gsf__least(last - first, job->tiles);
+        for (int64_t t = 0; t < p.count; t++, gsf__winograd_next(job, &at)) {
+            const int right = 2 * at.x + 1 < job->width, below = 2 * at.y + 1 < job->height;
+            const float* y = g->desc->dy + at.frame * job->out_frame + 2 * at.y * job->out_row + 2 * at.x * out;
+            const float* const pixels[4] = {y, right ? y + out : NULL, below ? y + job->out_row : NULL,
+                                            right && below ? y + job->out_row + out : NULL};
+            gsf__winograd_spread_tile(job, 0, &at, patch, v + t * in);
+            g->spread(pixels, out, z + t * out, job->tiles * out);
+        }
+        for (int64_t i = 0; i < GSF__WINOGRAD_POINTS; i++) {
+            p.a = v + i * job->tiles * in;
+            p.b = z + i * job->tiles * out;
+            p.c = sums + i * size;
+            g->kernels->multiply(&p);
+        }
+    }
+}
+
+static void gsf__winograd_grad_add(void* arg, size_t channel, int32_t worker) { // adds G' (sum of the bands) G to dweight
+    const gsf__conv_grad_job* g = (const gsf__conv_grad_job*)arg;
+    const int64_t in = g->layer.in, out = g->layer.out, size = in * g->out;
+    (void)worker;
+    for (int64_t n0 = 0; n0 < out; n0 += GSF__CONV_N) {
+        double u[GSF__WINOGRAD_POINTS][GSF__CONV_N] = {{0.0}}, rows[12][GSF__CONV_N];
+        const float* from = g->sums + (int64_t)channel * g->out + n0;
+        for (int64_t band = 0; band < g->bands; band++)
+            for (int i = 0; i < GSF__WINOGRAD_POINTS; i++, from += size)
+                for (int n = 0; n < GSF__CONV_N; n++) u[i][n] += (double)from[n];
+        for (int x = 0; x < 4; x++)
+            for (int n = 0; n < GSF__CONV_N; n++) {
+                const double a = 0.5 * (u[4 + x][n] + u[8 + x][n]);
+                rows[x][n] = u[x][n] + a;
+                rows[4 + x][n] = 0.5 * (u[4 + x][n] - u[8 + x][n]);
+                rows[8 + x][n] = a + u[12 + x][n];
+            }
+        const int64_t count = gsf__least(out - n0, GSF__CONV_N);
+        for (int64_t n = 0; n < count; n++) {
+            float* to = g->dweight + ((n0 + n) * in + (int64_t)channel) * 9;
+            for (int y = 0; y < 3; y++, to += 3) {
+                const double a = 0.5 * (rows[4 * y + 1][n] + rows[4 * y + 2][n]);
+                to[0] += (float)(rows[4 * y][n] + a);
+                to[1] += (float)(0.5 * (rows[4 * y + 1][n] - rows[4 * y + 2][n]));
+                to[2] += (float)(a + rows[4 * y + 3][n]);
+            }
+        }
+    }
+}
+
+static gsf_result gsf__winograd_grad_weight(gsf_context* ctx, gsf__conv_grad_job* g, gsf__nn_workspace* workspace) {
+    const gsf__nn_conv_desc* f = g->desc->forward;
+    gsf__conv_job* job = &g->tiles;
+    g->out = gsf__conv_blocks(&g->layer) * GSF__CONV_N;
+    *job = gsf__conv_begin(ctx, &g->layer, f->frames, f->height, f->width, 0, NULL);
+    gsf__conv_unborder(job);
+    job->in[0] = f->x;
+    job->tiles = GSF__WINOGRAD_STEP;
+    const int64_t size = GSF__WINOGRAD_POINTS * g->layer.in * g->out, tiles = job->frames * gsf__conv_tiles(job);
+    const int64_t most = gsf__least(gsf__least(GSF__CONV_GRAD_BANDS, GSF__CONV_GRAD_SUMS / size),
+                                    gsf__ceil_div(tiles, GSF__WINOGRAD_STEP));
+    g->band_tiles = gsf__ceil_div(tiles, most > 1 ? most : 1);
+    g->bands = gsf__ceil_div(tiles, g->band_tiles);
+    g->sums = (float*)gsf__nn_scratch(ctx, workspace, (size_t)(g->bands * size + gsf__conv_room(ctx, job)) * sizeof(float));
+    if (!g->sums) return GSF_ERROR_OUT_OF_MEMORY;
+    job->room = g->sums + g->bands * size;
+    g->spread = GSF__WIDE_KERNEL_OF(ctx->cpu_level, gsf__winograd_spread_grad);
+    gsf__parallel_for(ctx, (size_t)g->bands, gsf__winograd_grad_band, g);
+    gsf__parallel_for(ctx, (size_t)g->layer.in, gsf__winograd_grad_add, g);
+    return GSF_OK;
+}
+
 // Gradients of gsf__nn_convolve.
 GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_grad_desc* d) {
     gsf__nn_conv_desc forward = *d->forward;
@@ -19257,7 +19518,14 @@ GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_gr
     g.width = forward.halve ? forward.width / 2 : forward.width;
     if (d->dx) GSF__TRY(gsf__conv_grad_input(ctx, &g));
     const int64_t rows = forward.frames * g.height, taps = gsf__conv_taps(&g.layer), size = forward.weight->count;
-    if (d->dweight) {
+    if (d->dweight && g.layer.winograd && g.layer.kt == 1) {
+        gsf__nn_workspace own;
+        memset(&own, 0, sizeof own);
+        g.dweight = d->dweight;
+        const gsf_result result = gsf__winograd_grad_weight(ctx, &g, d->workspace ? d->workspace : &own);
+        gsf__nn_destroy_workspace(ctx, &own);
+        GSF__TRY(result);
+    } else if (d->dweight) {
         const int64_t most = gsf__least(GSF__CONV_GRAD_BANDS, gsf__least(GSF__CONV_GRAD_SUMS / size, rows));
         g.band_rows = gsf__ceil_div(rows, most > 1 ? most : 1);
         g.bands = gsf__ceil_div(rows, g.band_rows);
@@ -20388,6 +20656,7 @@ static gsf_result gsf__mini_convolve_grad(gsf__mini_run* r, gsf__nn_params* para
     d.accumulate = accumulate;
     d.dweight = gsf__nn_grad_of(params, layer->weight);
     d.dbias = gsf__nn_grad_of(params, layer->bias);
+    d.workspace = &r->workspace;
     return gsf__nn_conv_grad(r->ctx, &d);
 }
 

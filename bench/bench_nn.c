@@ -758,7 +758,7 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     for (size_t i = 0; i < weights; i++) w[i] *= 2.0f / sqrtf((float)channels * 27.0f);
     r.weight = gsf_nn_wrap_tensor("weight", w, 5, shape);
     r.ones = gsf_nn_wrap_tensor("ones", w + weights, 1, shape);
-    const gsf__conv_layer conv = {&r.weight, &r.ones, channels, channels, 3, 3};
+    const gsf__conv_layer conv = {&r.weight, &r.ones, channels, channels, 3, 3, 1};
     r.resnet.conv1 = r.resnet.conv2 = conv;
     r.resnet.norm1.weight = r.resnet.norm1.bias = r.resnet.norm2.weight = r.resnet.norm2.bias = &r.ones;
     r.resnet.norm1.eps = r.resnet.norm2.eps = 1e-6;

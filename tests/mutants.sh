@@ -15,7 +15,8 @@ gsfixer.h|test_gsfixer|JSON strings hold raw characters from 0x10 on|s/if \(c < 
 gsfixer.h|test_gsfixer|JSON escapes of control characters are short|s/\\\\u%04x/\\\\u%03x/
 gsfixer.h|test_resize|bicubic with a = -0.75, as OpenCV has it|s/const double a = -0\.5;/const double a = -0.75;/
 gsfixer.h|golden_metrics|SSIM: constants without their squares|s/c1 = gsf__vd_set\(0\.01 \* 0\.01\), c2 = gsf__vd_set\(0\.03 \* 0\.03\)/c1 = gsf__vd_set(0.01), c2 = gsf__vd_set(0.03)/
-gsfixer_nn.h|test_nn_vae|Winograd: a sign of the lower outputs|s/\(\(u1 - u2\) - u3\) \+ b/((u1 - u2) + u3) + b/
+gsfixer_nn.h|test_nn_vae|Winograd: a sign of the lower outputs|s/GSF_X\(3, \(u1 - u2\) - u3\)/GSF_X(3, (u1 - u2) + u3)/
+gsfixer_nn.h|test_nn_gradients|gradients: Winograd's weights, a sign|s/\(p\) - \(q\), left\);/(p) + (q), left);/
 gsfixer_nn.h|golden_metrics|LPIPS: features are not rectified|s/return gsf__v_max\(gsf__v_set\(0\.0f\), x\); \} \/\/ a NaN remains/return x; }/
 gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = gsf__sin_f64\(angle \* \(1\.0 - t\)\) \/ gsf__sin_f64\(angle\);/wa = 1.0 - t;/
 gsfixer_traj.h|golden_traj|windows overlap by one frame less|s/each = shared \/ \((\w+\.)?windows - 1\);/each = shared \/ ($1windows - 1) - 1;/
