@@ -6176,7 +6176,7 @@ typedef struct gsf__conv_kernels {
     // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, int add,
                          float* c, int64_t c_next, const float* ahead);
-    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and squares.
+    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and squares, or NULL.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
     void (*norm_silu)(const float* x, int64_t count, const float* mean, const float* scale, const float* offset, float* y);
@@ -6210,6 +6210,7 @@ static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int ac
         for (int64_t i = 0; i < n; i++) {
             float* y = &out[m * ldo + i];
             *y = accumulate ? *y + c[m * GSF__CONV_N + i] : c[m * GSF__CONV_N + i];
+            if (!sums) continue;
             sums[i] += (double)*y;
             sums[GSF__CONV_N + i] += (double)*y * (double)*y;
         }
@@ -6368,24 +6369,26 @@ GSF__INLINE_AVX2 void gsf__conv_add_squares(__m256d v, __m256d* sum, __m256d* sq
 // Stores eight outputs of `count` pixels.
 GSF__INLINE_AVX2 void gsf__conv_store8(const float* c, int64_t count, int accumulate, float* out, int64_t ldo,
                                        double* sums) {
-    __m256d s0 = _mm256_loadu_pd(sums), s1 = _mm256_loadu_pd(sums + 4), q0 = _mm256_loadu_pd(sums + GSF__CONV_N),
-            q1 = _mm256_loadu_pd(sums + GSF__CONV_N + 4);
+    __m256d s0 = _mm256_setzero_pd(), s1 = s0, q0 = s0, q1 = s0;
     for (int64_t m = 0; m < count; m++, c += GSF__CONV_N, out += ldo) {
         __m256 v = _mm256_loadu_ps(c);
         if (accumulate) v = _mm256_add_ps(_mm256_loadu_ps(out), v);
         _mm256_storeu_ps(out, v);
+        if (!sums) continue;
         gsf__conv_add_squares(_mm256_cvtps_pd(_mm256_castps256_ps128(v)), &s0, &q0);
         gsf__conv_add_squares(_mm256_cvtps_pd(_mm256_extractf128_ps(v, 1)), &s1, &q1);
     }
-    _mm256_storeu_pd(sums, s0), _mm256_storeu_pd(sums + 4, s1);
-    _mm256_storeu_pd(sums + GSF__CONV_N, q0), _mm256_storeu_pd(sums + GSF__CONV_N + 4, q1);
+    if (!sums) return;
+#define GSF_X(at, v) _mm256_storeu_pd(sums + (at), _mm256_add_pd(_mm256_loadu_pd(sums + (at)), v));
+    GSF_X(0, s0) GSF_X(4, s1) GSF_X(GSF__CONV_N, q0) GSF_X(GSF__CONV_N + 4, q1)
+#undef GSF_X
 }
 
 GSF__TARGET_AVX2 static void gsf__conv_store_avx2(const float* c, int64_t count, int64_t n, int accumulate, float* out,
                                                   int64_t ldo, double* sums) {
     int64_t i = 0;
-    for (; i + 8 <= n; i += 8) gsf__conv_store8(c + i, count, accumulate, out + i, ldo, sums + i);
-    if (i < n) gsf__conv_store_ref(c + i, count, n - i, accumulate, out + i, ldo, sums + i);
+    for (; i + 8 <= n; i += 8) gsf__conv_store8(c + i, count, accumulate, out + i, ldo, sums ? sums + i : NULL);
+    if (i < n) gsf__conv_store_ref(c + i, count, n - i, accumulate, out + i, ldo, sums ? sums + i : NULL);
 }
 
 #endif
@@ -6410,24 +6413,60 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_NN
 
-// The factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next).
-GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t c, float* v, int64_t next) {
-    for (int64_t i = 0; i < c; i += GSF__LANES, v += GSF__LANES) {
-        const size_t left = (size_t)(c - i);
-#define GSF_X(j)                                                                                          \
-        const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, left);                                \
-        const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, left);                                \
-        const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, left);                                \
-        const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, left);                                \
-        const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+// Of a vector of the channels from i on: `left` of them, in columns from `first` to before `end`.
+GSF__V_INLINE void GSF__V(gsf__winograd_spread_some)(const float* const rows[4], int64_t first, int64_t end, int64_t c,
+                                                     int64_t i, size_t left, float* v, int64_t next) {
+#define GSF_X(j)                                                                          \
+    const size_t n##j = j >= first && j < end ? left : 0;                                 \
+    const gsf__vf a##j = gsf__v_load_first(rows[0] + j * c + i, n##j);                    \
+    const gsf__vf b##j = gsf__v_load_first(rows[1] + j * c + i, n##j);                    \
+    const gsf__vf d##j = gsf__v_load_first(rows[2] + j * c + i, n##j);                    \
+    const gsf__vf e##j = gsf__v_load_first(rows[3] + j * c + i, n##j);                    \
+    const gsf__vf p0##j = a##j - d##j, p1##j = b##j + d##j, p2##j = d##j - b##j, p3##j = b##j - e##j;
+    GSF__FOUR(GSF_X)
 #undef GSF_X
-#define GSF_X(k)                                                             \
-        gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
-        gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
-        gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
-        gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#define GSF_X(k)                                                         \
+    gsf__v_store_first(v + (4 * k) * next, p##k##0 - p##k##2, left);     \
+    gsf__v_store_first(v + (4 * k + 1) * next, p##k##1 + p##k##2, left); \
+    gsf__v_store_first(v + (4 * k + 2) * next, p##k##2 - p##k##1, left); \
+    gsf__v_store_first(v + (4 * k + 3) * next, p##k##1 - p##k##3, left);
+    GSF__FOUR(GSF_X)
+#undef GSF_X
+}
+
+// The factors of 16 products from 4 x 4 pixels of c channels, at rows[0..3]: v (16, next). Columns before `first` and from
+// `end` on are zeros, which are not read.
+GSF__V_KERNEL void GSF__V(gsf__winograd_spread)(const float* const rows[4], int64_t first, int64_t end, int64_t c, float* v,
+                                                int64_t next) {
+    int64_t i = 0;
+    for (; first <= 0 && end >= 4 && i + GSF__LANES <= c; i += GSF__LANES, v += GSF__LANES)
+        GSF__V(gsf__winograd_spread_some)(rows, 0, 4, c, i, GSF__LANES, v, next);
+    for (; i < c; i += GSF__LANES, v += GSF__LANES)
+        GSF__V(gsf__winograd_spread_some)(rows, first, end, c, i, (size_t)(c - i), v, next);
+}
+
+// `left` of the outputs from i on of all tiles; sums, if not NULL: += values and squares
+GSF__V_INLINE void GSF__V(gsf__winograd_gather_some)(const float* m, int64_t next, int64_t pitch, int64_t count, gsf__vf bias,
+                                                     int64_t i, size_t left, float* const* y, int accumulate, gsf__vd* sums) {
+    for (int64_t t = 0; t < count; t++, m += pitch, y += 4) {
+#define GSF_X(k)                                                                                         \
+        const gsf__vf p##k = gsf__v_load(m + k * next), q##k = gsf__v_load(m + (k + 4) * next);          \
+        const gsf__vf r##k = gsf__v_load(m + (k + 8) * next), s##k = gsf__v_load(m + (k + 12) * next);   \
+        const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
+        GSF__FOUR(GSF_X)
+#undef GSF_X
+#define GSF_X(k, value)                                                                     \
+        if (y[k]) {                                                                         \
+            gsf__vf v = (value) + bias;                                                     \
+            if (accumulate) v = gsf__v_load_first(y[k] + i, left) + v;                      \
+            gsf__v_store_first(y[k] + i, v, left);                                          \
+            for (int h = 0; sums && h < GSF__HALVES; h++) {                                 \
+                const gsf__vd d = gsf__vd_half(v, h);                                       \
+                sums[h] = sums[h] + d;                                                      \
+                sums[GSF__HALVES + h] = gsf__vd_madd(d, d, sums[GSF__HALVES + h]);          \
+            }                                                                               \
+        }
+        GSF_X(0, (t0 + t1) + t2) GSF_X(1, (t1 - t2) - t3) GSF_X(2, (u0 + u1) + u2) GSF_X(3, (u1 - u2) - u3)
 #undef GSF_X
     }
 }
@@ -6440,38 +6479,16 @@ GSF__V_KERNEL void GSF__V(gsf__winograd_gather)(const float* m, int64_t next, in
     for (int64_t i = 0; i < n; i += GSF__LANES) {
         const size_t left = (size_t)(n - i);
         const gsf__vf b = gsf__v_load_first(bias + i, left);
-        gsf__vd sum[GSF__HALVES], square[GSF__HALVES];
-        for (int h = 0; h < GSF__HALVES; h++) sum[h] = square[h] = gsf__vd_set(0.0);
-        for (int64_t t = 0; t < count; t++) {
-            const float* from = m + t * pitch + i;
-            float* const* to = y + 4 * t;
-#define GSF_X(k)                                                                                                \
-            const gsf__vf p##k = gsf__v_load(from + k * next), q##k = gsf__v_load(from + (k + 4) * next);        \
-            const gsf__vf r##k = gsf__v_load(from + (k + 8) * next), s##k = gsf__v_load(from + (k + 12) * next); \
-            const gsf__vf t##k = (p##k + q##k) + r##k, u##k = (q##k - r##k) - s##k;
-            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
-#undef GSF_X
-#define GSF_X(k, value)                                                            \
-            if (to[k]) {                                                           \
-                gsf__vf v = (value) + b;                                           \
-                if (accumulate) v = gsf__v_load_first(to[k] + i, left) + v;        \
-                gsf__v_store_first(to[k] + i, v, left);                            \
-                for (int h = 0; sums && h < GSF__HALVES; h++) {                    \
-                    const gsf__vd d = gsf__vd_half(v, h);                          \
-                    sum[h] = sum[h] + d;                                           \
-                    square[h] = gsf__vd_madd(d, d, square[h]);                     \
-                }                                                                  \
-            }
-            GSF_X(0, (t0 + t1) + t2) GSF_X(1, (t1 - t2) - t3) GSF_X(2, (u0 + u1) + u2) GSF_X(3, (u1 - u2) - u3)
-#undef GSF_X
-        }
-        if (!sums) continue;
-        double a[GSF__LANES], q[GSF__LANES];
-        memcpy(a, sum, sizeof a);
-        memcpy(q, square, sizeof q);
-        for (int k = 0; k < GSF__LANES && (size_t)k < left; k++) {
-            sums[i + k] += a[k];
-            sums[pitch + i + k] += q[k];
+        gsf__vd all[2 * GSF__HALVES];
+        double values[2 * GSF__LANES];
+        for (int h = 0; h < 2 * GSF__HALVES; h++) all[h] = gsf__vd_set(0.0);
+        if (left >= GSF__LANES && !sums && !accumulate)
+            GSF__V(gsf__winograd_gather_some)(m + i, next, pitch, count, b, i, GSF__LANES, y, 0, NULL);
+        else GSF__V(gsf__winograd_gather_some)(m + i, next, pitch, count, b, i, left, y, accumulate, sums ? all : NULL);
+        memcpy(values, all, sizeof values);
+        for (int k = 0; sums && k < GSF__LANES && (size_t)k < left; k++) {
+            sums[i + k] += values[k];
+            sums[pitch + i + k] += values[GSF__LANES + k];
         }
     }
 }
@@ -6495,12 +6512,12 @@ typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel); 2D: w
                                                            .5 -.5 .5          0 -1  1  0
                                                            0   0   1          0  1  0 -1
    where * multiplies point by point and adds up over input channels. Each of the 16 points is a matrix product of its own,
-   tiles by channels by outputs. Work is divided into segments of up to 240 tiles, which hold all factors and products of
+   tiles by channels by outputs. Work is divided into segments of up to 120 tiles, which hold all factors and products of
    their tiles: weights, (frame of the kernel, 16, panel of 16 outputs, in, 16), are read once per segment. B' d B only adds, so
    that rounding errors stay those of a sum of products. */
 enum { GSF__WINOGRAD_POINTS = 16,
-       GSF__WINOGRAD_STEP = 60, GSF__WINOGRAD_TILES = 240, // tiles of a segment: least, most; multiples of M and M10
-       GSF__WINOGRAD_ROOM = 1 << 19 };                     // floats that more than the least number of tiles may take
+       GSF__WINOGRAD_STEP = 30, GSF__WINOGRAD_TILES = 120, // tiles of a segment: least, most; multiples of M and M10
+       GSF__WINOGRAD_FEW = 1 << 12 };                      // pairs of channels, whose weights stay in the cache
 
 // Where it pays: with few channels the sums of the tiles take longer than the products that they save.
 static int32_t gsf__conv_suits_winograd(const gsf__conv_layer* layer) {
@@ -6656,7 +6673,7 @@ typedef struct gsf__conv_job { // one frame of output, or more of a 2D convoluti
     double* partial;                 // (segments, groups, 2): sums and sums of squares; may be NULL
     int64_t tiles;                   // of Winograd's: tiles of a segment; 0: not by Winograd
     int64_t inputs;                  // channels
-    void (*spread)(const float* const rows[4], int64_t c, float* v, int64_t next);
+    void (*spread)(const float* const rows[4], int64_t first, int64_t end, int64_t c, float* v, int64_t next);
     void (*gather)(const float* m, int64_t next, int64_t pitch, int64_t count, const float* bias, int64_t n, float* const* y,
                    int accumulate, double* sums);
     float* room;                     // gsf__conv_room floats
@@ -6675,10 +6692,10 @@ static int64_t gsf__conv_segments(const gsf__conv_job* job) {
     if (job->tiles) return gsf__ceil_div(job->frames * gsf__conv_tiles(job), job->tiles);
     return job->frames * gsf__conv_frame_segments(job);
 }
-// Floats of a worker: the pixels of a tile, factors (16, tiles, in), products (16, panels, tiles, 16)
+// Floats of a worker: four pixels of zeros, factors (16, tiles, in), products (16, panels, tiles, 16)
 static int64_t gsf__winograd_room(const gsf__conv_job* job) {
     const int64_t sums = gsf__ceil_div(job->outputs, GSF__CONV_N) * GSF__CONV_N;
-    return job->tiles ? GSF__WINOGRAD_POINTS * (job->inputs + job->tiles * (job->inputs + sums)) : 0;
+    return job->tiles ? 4 * job->inputs + GSF__WINOGRAD_POINTS * job->tiles * (job->inputs + sums) : 0;
 }
 static int64_t gsf__conv_room(const gsf_context* ctx, const gsf__conv_job* job) {
     return ctx->parallel.worker_count * gsf__winograd_room(job);
@@ -6756,7 +6773,7 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
                     memcpy(tiles + p * next + i * GSF__CONV_N, b + p * job->panel, GSF__CONV_N * sizeof(float));
             gsf__conv_sum(job, &band, panels, job->outputs - n0, b + GSF__CONV_N, tiles, next);
             for (int64_t p = 0; p < panels; p++)
-                gsf__conv_store(job, &band, tiles + p * next, n0 + p * GSF__CONV_N, sums[p]);
+                gsf__conv_store(job, &band, tiles + p * next, n0 + p * GSF__CONV_N, partial ? sums[p] : NULL);
         }
         for (int64_t p = 0; partial && p < panels; p++) gsf__conv_add_groups(job, n0 + p * GSF__CONV_N, sums[p], partial);
     }
@@ -6795,21 +6812,14 @@ static void gsf__winograd_multiply(const gsf__conv_job* job, int64_t count, cons
         }
 }
 
-// The factors of a tile of input frame kt; patch: room for its pixels, if some are beyond the border.
-static void gsf__winograd_spread_tile(const gsf__conv_job* job, int64_t kt, const gsf__winograd_place* at, float* patch,
+// The factors of a tile of input frame kt
+static void gsf__winograd_spread_tile(const gsf__conv_job* job, int64_t kt, const gsf__winograd_place* at, const float* zeros,
                                       float* v) {
     const int64_t in = job->inputs, x = 2 * at->x - 1, y = 2 * at->y - 1;
-    const int64_t left = x < 0, columns = gsf__least(job->width - x, 4) - left;
-    const float *from = job->in[kt] + at->frame * job->in_frame + job->origin + in, *rows[4]; // of column 0
-    const int inside = columns == 4 && y >= 0 && y + 4 <= job->height;
-    if (!inside) memset(patch, 0, (size_t)(GSF__WINOGRAD_POINTS * in) * sizeof(float));
-    for (int64_t i = 0; i < 4; i++) {
-        rows[i] = inside ? from + (y + i) * job->in_stride + x * in : patch + 4 * i * in;
-        if (!inside && y + i >= 0 && y + i < job->height)
-            memcpy(patch + (4 * i + left) * in, from + (y + i) * job->in_stride + (x + left) * in,
-                   (size_t)(columns * in) * sizeof(float));
-    }
-    job->spread(rows, in, v, job->tiles * in);
+    const float *from = job->in[kt] + at->frame * job->in_frame + job->origin + (x + 1) * in, *rows[4];
+    for (int64_t i = 0; i < 4; i++)
+        rows[i] = y + i < 0 || y + i >= job->height ? zeros : from + (y + i) * job->in_stride;
+    job->spread(rows, x < 0, job->width - x, in, v, job->tiles * in);
 }
 
 static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
@@ -6819,14 +6829,15 @@ static void gsf__winograd_segment(void* arg, size_t segment, int32_t worker) {
     const int64_t blocks = gsf__ceil_div(job->outputs, GSF__CONV_N), next = blocks * job->tiles * GSF__CONV_N;
     const float *bias = job->packed, *weights = bias + blocks * GSF__CONV_N;
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
-    float *patch = job->room + worker * gsf__winograd_room(job), *v = patch + GSF__WINOGRAD_POINTS * in;
+    float *zeros = job->room + worker * gsf__winograd_room(job), *v = zeros + 4 * in;
     float* m = v + GSF__WINOGRAD_POINTS * job->tiles * in;
     float* pixels[GSF__WINOGRAD_TILES * 4];
     const gsf__winograd_place start = gsf__winograd_first(job, first);
+    memset(zeros, 0, (size_t)(4 * in) * sizeof(float));
     for (int64_t kt = 0; kt < job->kt; kt++) {
         gsf__winograd_place at = start;
         for (int64_t t = 0; t < count; t++, gsf__winograd_next(job, &at))
-            gsf__winograd_spread_tile(job, kt, &at, patch, v + t * in);
+            gsf__winograd_spread_tile(job, kt, &at, zeros, v + t * in);
         gsf__winograd_multiply(job, count, v, weights + kt * GSF__WINOGRAD_POINTS * blocks * in * GSF__CONV_N, kt > 0, m);
     }
     gsf__winograd_place at = start;
@@ -6908,12 +6919,10 @@ static int64_t gsf__conv_frame_size(int64_t height, int64_t width, int64_t chann
     return height * (width + 2) * channels;
 }
 
-// How many tiles fit in a segment.
+// Tiles of a segment: few, so that its factors stay in the cache, unless weights have to be read for every segment.
 static int64_t gsf__winograd_tiles(const gsf__conv_layer* layer, int64_t tiles) {
-    const int64_t each = GSF__WINOGRAD_POINTS * (layer->in + gsf__conv_blocks(layer) * GSF__CONV_N);
-    int64_t most = GSF__WINOGRAD_ROOM / each / GSF__WINOGRAD_STEP * GSF__WINOGRAD_STEP;
-    if (most < GSF__WINOGRAD_STEP) most = GSF__WINOGRAD_STEP;
-    return gsf__even_piece(tiles, gsf__least(most, GSF__WINOGRAD_TILES), GSF__WINOGRAD_STEP);
+    const int64_t most = layer->in * layer->out <= GSF__WINOGRAD_FEW ? GSF__WINOGRAD_STEP : GSF__WINOGRAD_TILES;
+    return gsf__even_piece(tiles, most, GSF__WINOGRAD_STEP);
 }
 
 // Initialises the members that frames of one size share: `frames` bordered ones of `in_height` x `in_width` at once. The caller
@@ -15729,30 +15738,20 @@ static void gsf__mini_join_row(void* arg, size_t index, int32_t worker) {
     gsf_nn_convert_tensor(r->net->attention.bias, 0, 1, &bias);
     for (int64_t x = 0; x < w; x++) {
         const int64_t at = (int64_t)index * w + x, first = b * n * plane + at % plane;
-        float *mean = r->frame + at * pitch + 4 * GSF__MINI_FRAME, *most = mean + e, *share = r->share + at * n;
+        float *mean = r->frame + at * pitch + 4 * GSF__MINI_FRAME, *share = r->share + at * n, *f = r->features + first * e;
         float top = 0.0f, sum;
-        memset(mean, 0, (size_t)(2 * e) * sizeof(float));
+        for (int64_t k = 0; k < n; k++)
+            if (!gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE))
+                memset(f + k * plane * e, 0, (size_t)e * sizeof(float));
+        GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__map_products)(attention, f, n, plane * e, e, 1.0f, share);
         for (int64_t k = 0; k < n; k++) {
-            float *f = r->features + (first + k * plane) * e, dot = bias;
-            if (!gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE)) {
-                memset(f, 0, (size_t)e * sizeof(float));
-                share[k] = -FLT_MAX;
-                continue;
-            }
-            for (int64_t i = 0; i < e; i++) dot += attention[i] * f[i];
-            share[k] = dot;
-            if (dot > top) top = dot;
+            share[k] = gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE) ? share[k] + bias : -FLT_MAX;
+            if (share[k] > top) top = share[k];
         }
         sum = expf(-top);
         for (int64_t k = 0; k < n; k++) sum += share[k] = share[k] > -FLT_MAX ? expf(share[k] - top) : 0.0f;
-        for (int64_t k = 0; k < n; k++) {
-            const float* f = r->features + (first + k * plane) * e;
-            share[k] /= sum;
-            for (int64_t i = 0; i < e; i++) {
-                mean[i] += 2.0f * share[k] * f[i];
-                if (f[i] > most[i]) most[i] = f[i];
-            }
-        }
+        for (int64_t k = 0; k < n; k++) share[k] /= sum;
+        GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__mini_mix)(f, n, plane * e, share, e, mean, mean + e);
     }
 }
 
@@ -16254,6 +16253,22 @@ GSF__V_KERNEL void GSF__V(gsf__map_products)(const float* from, const float* to,
             sum = gsf__v_madd(gsf__v_load_first(from + i, left), gsf__v_load_first(to + i, left), sum);
         }
         out[p] = scale * gsf__v_sum(sum + other);
+    }
+}
+
+// mean = the sum of 2 share[k] times row k of x, (n, next), and most = the largest, not below 0
+GSF__V_KERNEL void GSF__V(gsf__mini_mix)(const float* x, int64_t n, int64_t next, const float* share, int64_t count,
+                                         float* mean, float* most) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__vf sum = gsf__v_set(0.0f), top = sum;
+        for (int64_t k = 0; k < n; k++) {
+            const gsf__vf v = gsf__v_load_first(x + k * next + i, left);
+            sum = gsf__v_madd(gsf__v_set(2.0f * share[k]), v, sum);
+            top = gsf__v_max(top, v);
+        }
+        gsf__v_store_first(mean + i, sum, left);
+        gsf__v_store_first(most + i, top, left);
     }
 }
 
@@ -18506,11 +18521,38 @@ GSF__V_INLINE void GSF__V(gsf__multiply_wide_tile)(const gsf__grad_product* p, i
 #undef GSF_X
 }
 
+// The same for up to 8 rows and a vector: eight sums, so that an addition need not wait for the one before.
+GSF__V_INLINE void GSF__V(gsf__multiply_narrow_tile)(const gsf__grad_product* p, int64_t row, int64_t column, size_t left) {
+    const int64_t last = p->rows - row - 1, step = p->a_step;
+    const float *a = p->a + row * p->a_row, *b = p->b + column;
+    float* c = p->c + row * p->ldc + column;
+#define GSF_X(r)                                            \
+    const float* a##r = a + gsf__least(r, last) * p->a_row; \
+    gsf__vf c##r = gsf__v_set(0.0f);
+    GSF__SIX(GSF_X) GSF_X(6) GSF_X(7)
+#undef GSF_X
+    for (int64_t k = 0, at = 0; k < p->count; k++, at += step, b += p->ldb) {
+        const gsf__vf b0 = gsf__v_load_first(b, left);
+#define GSF_X(r) c##r = gsf__v_madd(gsf__v_set(a##r[at]), b0, c##r);
+        GSF__SIX(GSF_X) GSF_X(6) GSF_X(7)
+#undef GSF_X
+    }
+#define GSF_X(r) \
+    if (r <= last) gsf__v_store_first(c + (r) * p->ldc, gsf__v_load_first(c + (r) * p->ldc, left) + c##r, left);
+    GSF__SIX(GSF_X) GSF_X(6) GSF_X(7)
+#undef GSF_X
+}
+
 // Two vectors of columns at a time, three where their number is odd.
 GSF__V_KERNEL void GSF__V(gsf__multiply)(const gsf__grad_product* p) {
     for (int64_t j = 0; j < p->columns;) {
         const size_t left = (size_t)(p->columns - j), vectors = (left + GSF__LANES - 1) / GSF__LANES;
-        if (vectors > 1 && vectors % 2) {
+        if (vectors == 1) {
+            for (int64_t r = 0; r < p->rows; r += 8)
+                if (left == GSF__LANES) GSF__V(gsf__multiply_narrow_tile)(p, r, j, GSF__LANES);
+                else GSF__V(gsf__multiply_narrow_tile)(p, r, j, left);
+            j += GSF__LANES;
+        } else if (vectors % 2) {
             for (int64_t r = 0; r < p->rows; r += 4)
                 if (left >= 3 * GSF__LANES) GSF__V(gsf__multiply_wide_tile)(p, r, j, 3 * GSF__LANES);
                 else GSF__V(gsf__multiply_wide_tile)(p, r, j, left);
@@ -18739,6 +18781,42 @@ GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int
 }
 
 #endif
+// The gradient of gsf__mini_mix, added to dx (n, next), and n products with `attention`, whose gradients are `dlogit`, that of
+// `attention` added to `dattention` (count).
+GSF__V_KERNEL void GSF__V(gsf__mini_mix_grad)(const float* x, int64_t n, int64_t next, const float* share, int64_t count,
+                                              const float* most, const float* dmean, const float* attention,
+                                              const float* dlogit, double* dattention, float* dx) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf mean = gsf__v_load_first(dmean + i, left), by = gsf__v_load_first(attention + i, left);
+        const gsf__vf top = gsf__v_load_first(most + i, left), none = gsf__v_set(0.0f);
+        gsf__vf rest = gsf__v_load_first(dmean + count + i, left); // of the maximum; of equal ones the first is it
+        gsf__vd sums[GSF__HALVES];
+        for (int h = 0; h < GSF__HALVES; h++) sums[h] = gsf__vd_set(0.0);
+        for (int64_t k = 0; k < n; k++) {
+            const gsf__vf v = gsf__v_load_first(x + k * next + i, left), slope = gsf__v_set(dlogit[k]), product = slope * v;
+            const gsf__vf d = gsf__v_madd(gsf__v_set(2.0f * share[k]), mean, slope * by);
+            const gsf__vf lower = gsf__v_select(gsf__v_lt(v, top), none, rest);
+            float* to = dx + k * next + i;
+            gsf__v_store_first(to, gsf__v_load_first(to, left) + d + lower, left);
+            rest = rest - lower;
+            for (int h = 0; h < GSF__HALVES; h++) sums[h] = sums[h] + gsf__vd_half(product, h);
+        }
+        double all[GSF__LANES];
+        memcpy(all, sums, sizeof all);
+        for (int l = 0; l < GSF__LANES && (size_t)l < left; l++) dattention[i + l] += all[l];
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__mini_add_positive)(const float* x, const float* from, int64_t count, float* to) {
+    const gsf__vf none = gsf__v_set(0.0f); // to += from where x is positive
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf d = gsf__v_load_first(from + i, left), positive = gsf__v_load_first(x + i, left);
+        gsf__v_store_first(to + i, gsf__v_load_first(to + i, left) + gsf__v_select(gsf__v_lt(none, positive), d, none), left);
+    }
+}
+
 // For the gradient of Winograd's weights: A dy A' of 2 x 2 pixels of n outputs, y[0..3], NULL beyond the border: z (16, next).
 GSF__V_KERNEL void GSF__V(gsf__winograd_spread_grad)(const float* const y[4], int64_t n, float* z, int64_t next) {
     for (int64_t i = 0; i < n; i += GSF__LANES, z += GSF__LANES) {
@@ -19384,17 +19462,18 @@ static void gsf__conv_grad_weight(void* arg, size_t chunk, int32_t worker) {
     const int64_t stride = f->halve ? 2 : 1, pad = f->halve ? 0 : kernel / 2, last = g->band_rows * (band + 1);
     const int64_t dx = tap % kernel - pad, dy = tap / kernel % kernel - pad, dt = tap / (kernel * kernel) - g->layer.kt + 1;
     const int64_t room = f->width - 1 - dx, x0 = dx < 0 ? 1 : 0;
-    const int64_t x1 = room < 0 ? 0 : gsf__least(g->width, room / stride + 1);
+    const int64_t x1 = room < 0 ? 0 : gsf__least(g->width, room / stride + 1), end = gsf__least(last, f->frames * g->height);
+    const int64_t step = taps == 1 && stride == 1 ? end - band * g->band_rows : 1; // by 1 x 1 all rows are one
     gsf__grad_product p;
     p.a_row = 1;
     p.a_step = stride * in;
     p.ldb = p.ldc = p.columns = out;
     p.rows = gsf__least(in - channel, GSF__CONV_GRAD_CHANNELS);
-    p.count = x1 - x0;
+    p.count = step * (x1 - x0);
     p.c = g->sums + (unit * in + channel) * out;
     (void)worker;
     memset(p.c, 0, (size_t)(p.rows * out) * sizeof(float));
-    for (int64_t r = band * g->band_rows; p.count > 0 && r < last && r < f->frames * g->height; r++) {
+    for (int64_t r = band * g->band_rows; p.count > 0 && r < end; r += step) {
         const int64_t y = r % g->height * stride + dy, t = r / g->height + dt;
         if (y < 0 || y >= f->height) continue;
         const float* frame = t >= 0 ? f->x + t * f->height * f->width * in
@@ -19423,7 +19502,7 @@ static void gsf__winograd_grad_band(void* arg, size_t band, int32_t worker) {
     const gsf__conv_job* job = &g->tiles;
     const int64_t in = job->inputs, out = job->outputs, size = in * g->out;
     const int64_t total = job->frames * gsf__conv_tiles(job), last = gsf__least(((int64_t)band + 1) * g->band_tiles, total);
-    float *patch = job->room + worker * gsf__winograd_room(job), *v = patch + GSF__WINOGRAD_POINTS * in;
+    float *zeros = job->room + worker * gsf__winograd_room(job), *v = zeros + 4 * in;
     float *z = v + GSF__WINOGRAD_POINTS * job->tiles * in, *sums = g->sums + (int64_t)band * GSF__WINOGRAD_POINTS * size;
     gsf__winograd_place at = gsf__winograd_first(job, (int64_t)band * g->band_tiles);
     gsf__grad_product p;
@@ -19431,6 +19510,7 @@ static void gsf__winograd_grad_band(void* arg, size_t band, int32_t worker) {
     p.a_step = p.rows = in;
     p.ldb = p.columns = out;
     p.ldc = g->out;
+    memset(zeros, 0, (size_t)(4 * in) * sizeof(float));
     memset(sums, 0, (size_t)(GSF__WINOGRAD_POINTS * size) * sizeof(float));
     for (int64_t first = (int64_t)band * g->band_tiles; first < last; first += job->tiles) {
         p.count = gsf__least(last - first, job->tiles);
@@ -19439,7 +19519,7 @@ static void gsf__winograd_grad_band(void* arg, size_t band, int32_t worker) {
             const float* y = g->desc->dy + at.frame * job->out_frame + 2 * at.y * job->out_row + 2 * at.x * out;
             const float* const pixels[4] = {y, right ? y + out : NULL, below ? y + job->out_row : NULL,
                                             right && below ? y + job->out_row + out : NULL};
-            gsf__winograd_spread_tile(job, 0, &at, patch, v + t * in);
+            gsf__winograd_spread_tile(job, 0, &at, zeros, v + t * in);
             g->spread(pixels, out, z + t * out, job->tiles * out);
         }
         for (int64_t i = 0; i < GSF__WINOGRAD_POINTS; i++) {
@@ -19488,10 +19568,10 @@ static gsf_result gsf__winograd_grad_weight(gsf_context* ctx, gsf__conv_grad_job
     *job = gsf__conv_begin(ctx, &g->layer, f->frames, f->height, f->width, 0, NULL);
     gsf__conv_unborder(job);
     job->in[0] = f->x;
-    job->tiles = GSF__WINOGRAD_STEP;
+    job->tiles = 2 * GSF__WINOGRAD_STEP;
     const int64_t size = GSF__WINOGRAD_POINTS * g->layer.in * g->out, tiles = job->frames * gsf__conv_tiles(job);
     const int64_t most = gsf__least(gsf__least(GSF__CONV_GRAD_BANDS, GSF__CONV_GRAD_SUMS / size),
-                                    gsf__ceil_div(tiles, GSF__WINOGRAD_STEP));
+                                    gsf__ceil_div(tiles, job->tiles));
     g->band_tiles = gsf__ceil_div(tiles, most > 1 ? most : 1);
     g->bands = gsf__ceil_div(tiles, g->band_tiles);
     g->sums = (float*)gsf__nn_scratch(ctx, workspace, (size_t)(g->bands * size + gsf__conv_room(ctx, job)) * sizeof(float));
@@ -20664,17 +20744,18 @@ static void gsf__mini_relu_grad(gsf__mini_run* r, const float* x, int64_t count,
     gsf__nn_activate_grad(r->ctx, GSF__NN_RELU, x, dx, count, dx);
 }
 
-typedef struct gsf__mini_add_job { // to += from where x is positive
+typedef struct gsf__mini_add_job {
     const float *x, *from;
     float* to;
     int64_t count;
+    void (*add)(const float* x, const float* from, int64_t count, float* to);
 } gsf__mini_add_job;
 
 static void gsf__mini_add_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__mini_add_job* job = (const gsf__mini_add_job*)arg;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
     (void)worker;
-    for (int64_t i = begin; i < end; i++) job->to[i] += job->x[i] > 0.0f ? job->from[i] : 0.0f;
+    job->add(job->x + begin, job->from + begin, end - begin, job->to + begin);
 }
 
 // dx: the gradient of the block's result, then of its input
@@ -20685,7 +20766,7 @@ static gsf_result gsf__mini_block_grad(gsf__mini_run* r, gsf__nn_params* params,
     GSF__TRY(gsf__mini_convolve_grad(r, params, &block->second, p->b[k], r->batch, level, 0, dx, 0, p->db));
     gsf__mini_relu_grad(r, p->b[k], count, p->db);
     GSF__TRY(gsf__mini_convolve_grad(r, params, &block->first, p->a[k], r->batch, level, 0, p->db, 0, p->da));
-    gsf__mini_add_job job = {p->a[k], p->da, dx, count};
+    gsf__mini_add_job job = {p->a[k], p->da, dx, count, GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__mini_add_positive)};
     gsf__parallel_for(r->ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__mini_add_chunk, &job);
     return GSF_OK;
 }
@@ -20794,32 +20875,15 @@ static void gsf__mini_join_grad_row(void* arg, size_t index, int32_t worker) {
     gsf_nn_convert_tensor(r->net->attention.weight, 0, e, attention);
     memset(dattention, 0, (size_t)(e + 1) * sizeof(double));
     for (int64_t x = 0; x < w; x++) {
-        const int64_t at = (int64_t)index * w + x, first = b * n * plane + at % plane;
-        const float *dmean = r->dframe + at * pitch + 4 * GSF__MINI_FRAME, *dmost = dmean + e, *share = r->share + at * n;
+        const int64_t at = (int64_t)index * w + x, first = (b * n * plane + at % plane) * e;
+        const float *dmean = r->dframe + at * pitch + 4 * GSF__MINI_FRAME, *share = r->share + at * n;
         const float* most = r->frame + at * pitch + 4 * GSF__MINI_FRAME + e;
         float total = 0.0f;
-        for (int64_t k = 0; k < n; k++) {
-            const float* f = r->features + (first + k * plane) * e;
-            slope[k] = 0.0f;
-            for (int64_t i = 0; i < e; i++) slope[k] += 2.0f * dmean[i] * f[i];
-            total += share[k] * slope[k];
-        }
-        for (int64_t k = 0; k < n; k++) {
-            const float *f = r->features + (first + k * plane) * e, dlogit = share[k] * (slope[k] - total);
-            float* df = r->dfeatures + (first + k * plane) * e;
-            for (int64_t i = 0; i < e; i++) {
-                df[i] += 2.0f * share[k] * dmean[i] + dlogit * attention[i];
-                dattention[i] += (double)(dlogit * f[i]);
-            }
-            dattention[e] += (double)dlogit;
-        }
-        for (int64_t i = 0; i < e; i++) // of equal ones the first is the maximum; at 0 the slope is cut off anyway
-            for (int64_t k = 0; k < n; k++) {
-                const int64_t to = (first + k * plane) * e + i;
-                if (r->features[to] < most[i]) continue;
-                r->dfeatures[to] += dmost[i];
-                break;
-            }
+        GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__map_products)(dmean, r->features + first, n, plane * e, e, 2.0f, slope);
+        for (int64_t k = 0; k < n; k++) total += share[k] * slope[k];
+        for (int64_t k = 0; k < n; k++) dattention[e] += (double)(slope[k] = share[k] * (slope[k] - total));
+        GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__mini_mix_grad)(r->features + first, n, plane * e, share, e, most, dmean,
+                                                                   attention, slope, dattention, r->dfeatures + first);
     }
 }
 

@@ -31,7 +31,7 @@ static double draw_of(const mini_batch* b, size_t sample, int which) {
 }
 
 static float curved(const tone_curve* t, float x) {
-    const float at = gsf__mini_clamp(x, 0.0f, 1.0f) * BATCH_TABLE;
+    const float at = x >= 1.0f ? BATCH_TABLE : x > 0.0f ? x * BATCH_TABLE : 0.0f;
     const int i = at >= BATCH_TABLE ? BATCH_TABLE - 1 : (int)at;
     return t->table[i] + (at - (float)i) * (t->table[i + 1] - t->table[i]);
 }
@@ -55,13 +55,22 @@ static tone_curve draw_tone(const mini_batch* b, size_t sample) {
     return t;
 }
 
-static void read_pixel(const uint8_t* from, mini_sample s, int64_t at, int64_t pixels) {
-    for (int k = 0; k < GSF__MINI_FRAME; k++) s.frame[at * GSF__MINI_FRAME + k] = data_float(from[k], 0);
-    for (int k = 0; k < 3; k++) s.truth[3 * at + k] = data_float(from[GSF__MINI_FRAME + k], 0);
-    for (int r = 0; r < DATA_REFERENCES; r++)
-        for (int k = 0; k < GSF__MINI_REFERENCE; k++)
-            s.shown[(r * pixels + at) * GSF__MINI_REFERENCE + k] =
-                data_float(from[DATA_FRAME + r * GSF__MINI_REFERENCE + k], data_is_signed(k));
+typedef struct byte_values { float of[2][256]; } byte_values; // data_float of all bytes, without and with a sign
+
+static byte_values list_values(void) {
+    byte_values v;
+    for (int i = 0; i < 512; i++) v.of[i / 256][i % 256] = data_float((uint8_t)(i % 256), i / 256);
+    return v;
+}
+
+static void read_pixel(const byte_values* values, const uint8_t* from, mini_sample s, int64_t at, int64_t pixels) {
+    for (int k = 0; k < GSF__MINI_FRAME; k++) s.frame[at * GSF__MINI_FRAME + k] = values->of[0][from[k]];
+    for (int k = 0; k < 3; k++) s.truth[3 * at + k] = values->of[0][from[GSF__MINI_FRAME + k]];
+    for (int r = 0; r < DATA_REFERENCES; r++) {
+        const uint8_t* plane = from + DATA_FRAME + r * GSF__MINI_REFERENCE;
+        float* to = s.shown + (r * pixels + at) * GSF__MINI_REFERENCE;
+        for (int k = 0; k < GSF__MINI_REFERENCE; k++) to[k] = values->of[data_is_signed(k)][plane[k]];
+    }
 }
 
 // Colours of a pixel in another tone; the residual is the difference between the photo and its render, each in that tone.
@@ -149,12 +158,13 @@ static void make_sample(void* arg, size_t index, int32_t worker) {
     const tone_curve curve = draw_tone(b, sample);
     // Apart from each other, since splats of few photos fit these and are wrong elsewhere: only photos tell what is right.
     const float render_part = draw_part(b, sample, 7), residual_part = draw_part(b, sample, 15);
+    const byte_values values = list_values();
     (void)worker;
     for (int64_t y = 0; y < crop; y++)
         for (int64_t x = 0; x < crop; x++) {
             const int64_t at = y * crop + x, v = swap ? x : y, u = swap ? y : x;
             const int64_t row = frame * height + y0 + (flip ? crop - 1 - v : v), column = x0 + (mirror ? crop - 1 - u : u);
-            read_pixel((const uint8_t*)t->data + (row * width + column) * DATA_PIXEL, s, at, pixels);
+            read_pixel(&values, (const uint8_t*)t->data + (row * width + column) * DATA_PIXEL, s, at, pixels);
             tone_pixel(&curve, s, at, pixels);
             better_pixel(render_part, residual_part, s, at, pixels);
         }

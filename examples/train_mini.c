@@ -342,6 +342,7 @@ static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_te
     const size_t planes = GSF__MINI_FRAME + DATA_REFERENCES * GSF__MINI_REFERENCE;
     const double share = 1.0 / (double)frames->shape[0];
     float* memory = (float*)gsf_alloc(&t->ctx, (size_t)pixels, (planes + 3) * sizeof(float));
+    const byte_values values = list_values();
     checking c;
     memset(&c, 0, sizeof c);
     gsf_result result = gsf__mini_begin(&t->ctx, net, 1, DATA_REFERENCES, width, height, 0, &c.run);
@@ -353,7 +354,7 @@ static gsf_result check_scene(training* t, const gsf__mini* net, const gsf_nn_te
     for (int64_t f = 0; f < frames->shape[0] && result == GSF_OK; f++) {
         const uint8_t* from = (const uint8_t*)frames->data + f * pixels * DATA_PIXEL;
         figures squares;
-        for (int64_t i = 0; i < pixels; i++) read_pixel(from + i * DATA_PIXEL, c.sample, i, pixels);
+        for (int64_t i = 0; i < pixels; i++) read_pixel(&values, from + i * DATA_PIXEL, c.sample, i, pixels);
         result = measure_frame(&c, &squares);
         add_frame(all, squares, share);
         const float part = (float)fmin(1.0, sqrt(pow(10.0, -0.1 * GOOD_DECIBELS) / fmax(squares.before, 1e-10)));
