@@ -374,7 +374,8 @@ def nn_sections(lines, rows, has_pipeline):
           [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
     lines += ["Sizes are those of the released model; the smallest cases are measured with every instruction set. Shares are "
               "relative to the peaks above: of 8-bit layers to the integer peak, of bf16 products to the bf16 peak, of all "
-              "others to the multiply-add peak. Bandwidth is relative to a sweep over as much memory or, where GEMV cases "
+              "others to the multiply-add peak. Convolutions by 3 x 3 and their gradients count the products of a direct sum, of "
+              "which Winograd's algorithm needs 4 of 9, so that their share can exceed 100 %. Bandwidth is relative to a sweep over as much memory or, where GEMV cases "
               "cycle through 1 GiB of weights, to reading it between rounds. Errors are relative to sums in double precision. "
               "The last column is the peers' time divided by ours, timed alternately in the same run (`bench/peers_nn.py`), "
               "fastest first: PyTorch in its default configuration, PyTorch with oneDNN's linear layers on prepacked weights, "
