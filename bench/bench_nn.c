@@ -1,7 +1,8 @@
 // bench_nn.c - run time and error of the network kernels.
 // By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
 //
-//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER | --pipeline FOLDER...]
+//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME]
+//              [--model FOLDER | --pipeline FOLDER... | --mini FILE]
 //
 // Measures the machine's peaks (multiply-adds, integer and bf16 dot products per second; memory bandwidth by size of the
 // buffer, when first needed), then every kernel at the sizes of the released model and at a small size, for each
@@ -14,7 +15,7 @@
 // and one forward pass of its transformer once, at the configured size: seconds, operations and peak anonymous memory
 // (make_model writes such a folder; the released size takes hours here). --pipeline restores a clip with a small model,
 // with every solver, fewer steps and each option that skips work: run time and error of the frames. Further folders
-// hold the same weights in other dtypes.
+// hold the same weights in other dtypes. --mini times a frame of the restorer mini with these weights.
 #define GSF_NN_TRAINING
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
@@ -29,7 +30,7 @@
 typedef struct bench_options {
     int json, quick, threads;
     gsf_cpu_level level; // for all but the smallest cases, which run at every level
-    const char *filter, *model, *pipelines[4];
+    const char *filter, *model, *mini, *pipelines[4];
     int pipeline_count;
 } bench_options;
 
@@ -1691,6 +1692,46 @@ static void bench_captions(const bench_options* o) {
     }
 }
 
+// ---- a frame of the restorer mini ---------------------------------------------------
+
+typedef struct bench_mini {
+    gsf__mini net;
+    gsf__mini_run run;
+    gsf__mini_input in;
+} bench_mini;
+
+static void bench_run_mini(gsf_context* ctx, void* arg) {
+    bench_mini* b = (bench_mini*)arg;
+    bench_require(ctx, gsf__mini_forward(&b->run, &b->in));
+}
+
+static void bench_one_mini(const bench_options* o, int threads) {
+    enum { WIDTH = 720, HEIGHT = 480, REFERENCES = 3 };
+    const char* name = "mini 720x480, 3 references";
+    const size_t pixels = (size_t)WIDTH * HEIGHT, frame = pixels * GSF__MINI_FRAME;
+    const size_t all = frame + REFERENCES * pixels * GSF__MINI_REFERENCE;
+    gsf_context ctx;
+    bench_mini b;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
+    memset(&b, 0, sizeof b);
+    float* planes = (float*)bench_alloc(&ctx, all, sizeof(float));
+    bench_fill(planes, all * sizeof(float), GSF_NN_F32, 7);
+    for (size_t i = 0; i < all; i++) planes[i] = fabsf(planes[i]); // all references show something everywhere
+    b.in.width = WIDTH;
+    b.in.height = HEIGHT;
+    b.in.references = REFERENCES;
+    b.in.frame = planes;
+    b.in.shown = planes + frame;
+    bench_require(&ctx, gsf__mini_open(&ctx, o->mini, NULL, 0, &b.net));
+    bench_require(&ctx, gsf__mini_begin(&ctx, &b.net, 1, REFERENCES, WIDTH, HEIGHT, 0, &b.run));
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, (double)pixels, "pixel");
+    bench_time(o, &ctx, &row, bench_run_mini, &b, 1.0);
+    bench_print(o->json, &row);
+    gsf__mini_end(&b.run);
+    gsf__mini_close(&ctx, &b.net);
+    gsf_free(&ctx, planes);
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -1702,11 +1743,12 @@ int main(int argc, char** argv) {
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--isa") == 0) o.level = bench_level_of(argv[++i]);
         else if (value && strcmp(argv[i], "--model") == 0) o.model = argv[++i];
+        else if (value && strcmp(argv[i], "--mini") == 0) o.mini = argv[++i];
         else if (value && strcmp(argv[i], "--pipeline") == 0 && o.pipeline_count < 4)
             o.pipelines[o.pipeline_count++] = argv[++i];
         else {
             fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] "
-                            "[--model FOLDER] [--pipeline FOLDER]...\n");
+                            "[--model FOLDER] [--pipeline FOLDER]... [--mini FILE]\n");
             return 2;
         }
     }
@@ -1722,8 +1764,10 @@ int main(int argc, char** argv) {
         if (o.threads && o.threads != threads) continue;
         BENCH_EACH(level) bench_machine(&o, level, threads);
     }
-    if (o.model || o.pipeline_count) {
+    if (o.mini || o.model || o.pipeline_count) {
         gsf_free(&ctx, memory);
+        for (int threads = 1; o.mini && threads <= 2; threads++) bench_one_mini(&o, threads);
+        if (o.mini) return 0;
         if (o.model) bench_whole_model(&o);
         else bench_pipelines(&o);
         return 0;
