@@ -15740,12 +15740,14 @@ static void gsf__mini_join_row(void* arg, size_t index, int32_t worker) {
         const int64_t at = (int64_t)index * w + x, first = b * n * plane + at % plane;
         float *mean = r->frame + at * pitch + 4 * GSF__MINI_FRAME, *share = r->share + at * n, *f = r->features + first * e;
         float top = 0.0f, sum;
-        for (int64_t k = 0; k < n; k++)
-            if (!gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE))
-                memset(f + k * plane * e, 0, (size_t)e * sizeof(float));
+        uint32_t showing = 0; // a bit for each reference
+        for (int64_t k = 0; k < n; k++) {
+            if (gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE)) showing |= 1u << k;
+            else memset(f + k * plane * e, 0, (size_t)e * sizeof(float));
+        }
         GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__map_products)(attention, f, n, plane * e, e, 1.0f, share);
         for (int64_t k = 0; k < n; k++) {
-            share[k] = gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE) ? share[k] + bias : -FLT_MAX;
+            share[k] = showing >> k & 1u ? share[k] + bias : -FLT_MAX;
             if (share[k] > top) top = share[k];
         }
         sum = expf(-top);

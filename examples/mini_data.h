@@ -22,6 +22,8 @@ typedef struct data_desc { // of all scenes
     const char* dir;
     int pixels;      // the longer side, at least, and at most 1.4 times as much; the other is two thirds of it
     int fit;         // step of the last round
+    const gsf_restorer* own; // NULL, or a restorer whose frames half of the scenes get in the rounds: then follow frames of the
+                             // splats at the end, at cameras of photos that nobody took
 } data_desc;
 
 static int data_is_signed(int plane) { // of a reference: kept within [-1,1]
@@ -41,6 +43,8 @@ typedef struct data_probe { // a restorer that restores nothing and writes down 
     size_t photos;
     int rounds;                // begun
     float help;                // part of the truth in what it returns, so that later rounds see repaired splats
+    const gsf_restorer* own;   // NULL, or what restores instead
+    int final;                 // after the last step: all frames are taken
     size_t count, room;        // frames; of bytes
     int64_t width, height;
     uint8_t* bytes;
@@ -48,19 +52,23 @@ typedef struct data_probe { // a restorer that restores nothing and writes down 
 
 static gsf_result probe_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
                               gsf_restorer_info* out) {
-    (void)user, (void)ctx, (void)frames, (void)width, (void)height;
+    const gsf_restorer* own = ((data_probe*)user)->own;
+    const gsf_result result = own ? own->query_fn(own->user, ctx, frames, width, height, out) : GSF_OK;
     out->needs_depth = out->needs_alpha = 1;
     out->needs_carried = DATA_REFERENCES;
-    return GSF_OK;
+    return result;
 }
 
 static gsf_result probe_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
-    (void)ctx, (void)references, (void)count;
-    ((data_probe*)user)->rounds++;
-    return GSF_OK;
+    data_probe* p = (data_probe*)user;
+    p->rounds++;
+    return p->own ? p->own->begin_fn(p->own->user, ctx, references, count) : GSF_OK;
 }
 
-static void probe_end(void* user, gsf_context* ctx) { (void)user, (void)ctx; }
+static void probe_end(void* user, gsf_context* ctx) {
+    const gsf_restorer* own = ((data_probe*)user)->own;
+    if (own) own->end_fn(own->user, ctx);
+}
 
 // That of the photos around a camera, as carried photos have it (>>carry): exposure changes gradually along a capture.
 static float probe_exposure(const data_probe* p, const gsf_camera* camera) {
@@ -125,7 +133,7 @@ static gsf_result probe_frame(gsf_context* ctx, data_probe* p, const gsf_restore
     return result;
 }
 
-// Writes down every other frame of a window.
+// Writes down every other frame of a window, or all of them.
 static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_window* w) {
     data_probe* p = (data_probe*)user;
     const int64_t width = w->color[0].width, height = w->color[0].height, pixels = width * height;
@@ -133,7 +141,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
     if (!p->bytes) {
         p->width = width;
         p->height = height;
-        p->room = (size_t)(pixels * DATA_PIXEL) * 3 * DATA_WINDOWS * DATA_WINDOW;
+        p->room = (size_t)(pixels * DATA_PIXEL) * (3 * DATA_WINDOWS * DATA_WINDOW + DATA_VIEWS);
         p->bytes = (uint8_t*)gsf_alloc(ctx, p->room, 1);
     }
     float* planes = (float*)gsf_alloc(ctx, (size_t)pixels * (GSF__MINI_REFERENCE + 1), sizeof(float));
@@ -141,9 +149,9 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
     gsf_result result = p->bytes && planes && truth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
         float *color = (float*)w->out_color[i].data, *confidence = (float*)w->out_confidence[i].data;
-        const int taken = w->reference_index[i] < 0 && (i + w->clip + p->rounds) % 2 == 0;
+        const int taken = p->final || (w->reference_index[i] < 0 && (i + w->clip + p->rounds) % 2 == 0);
         if (taken) result = probe_frame(ctx, p, w, i, planes, truth);
-        for (int64_t k = 0; k < pixels; k++) {
+        for (int64_t k = 0; k < pixels && !p->own; k++) {
             confidence[k] = taken ? p->help : 0.0f;
             for (int64_t c = 3 * k; c < 3 * k + 3; c++) {
                 const float render = ((const float*)w->color[i].data)[c];
@@ -151,8 +159,32 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
             }
         }
     }
+    if (result == GSF_OK && p->own) result = p->own->restore_fn(p->own->user, ctx, w);
     gsf_free(ctx, planes);
     gsf_free(ctx, truth);
+    return result;
+}
+
+// Takes frames of the splats as they are, at cameras that were not trained on.
+static gsf_result data_finish(gsf_context* ctx, gsf_fixer* fixer, const gsf_scene* scene, const uint32_t* train, size_t trained,
+                              data_probe* p) {
+    enum { MOST = 10 };
+    gsf_camera cameras[DATA_VIEWS];
+    gsf_image images[2 * MOST];
+    size_t count = 0, used = 0;
+    memset(images, 0, sizeof images);
+    for (uint32_t i = 0; i < scene->view_count; i++) {
+        if (used < trained && train[used] == i) used++;
+        else cameras[count++] = scene->views[i].camera;
+    }
+    const size_t taken = count < MOST ? count : MOST;
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < taken; i++) cameras[i] = cameras[i * count / taken];
+    for (size_t i = 0; i < 2 * taken && result == GSF_OK; i++)
+        result = gsf_make_image(ctx, GSF_F32, cameras[0].width, cameras[0].height, i < taken ? 3 : 1, &images[i]);
+    p->final = 1;
+    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, fixer, cameras, taken, images, images + taken);
+    for (size_t i = 0; i < 2 * taken; i++) gsf_destroy_image(ctx, &images[i]);
     return result;
 }
 
@@ -172,7 +204,7 @@ static make_scene_options data_options(const data_desc* d, uint64_t seed) {
     return o;
 }
 
-// Runs the loop with the probe until its last round is over.
+// Runs the loop with the probe until its last round is over or, if that restores, to its end.
 static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* folder, const make_scene_options* o,
                            data_probe* p) {
     static const size_t views_of[8] = {3, 3, 4, 3, 5, 6, 9, 12};
@@ -204,16 +236,17 @@ static gsf_result data_run(gsf_context* ctx, const data_desc* d, const char* fol
     if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &scene, train, count, NULL, &start, NULL);
     gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&scene, count, GSF_QUALITY_EXACT);
     desc.trajectory = seed / 16 % 2 ? GSF_TRAJ_REFERENCE : GSF_TRAJ_SPREAD; // frames far from the photos, and near them
-    desc.train.iterations = d->fit + 101;
+    desc.train.iterations = d->fit + (p->own ? 121 : 101); // a fifth of the last round's step, as in the loop
     desc.train.seed = seed;
     desc.first_round = d->fit / 3;
     desc.last_round = d->fit;
     desc.windows = count < DATA_WINDOWS ? (int32_t)count : DATA_WINDOWS;
     desc.window_frames = DATA_WINDOW;
     if (result == GSF_OK) result = gsf_splat_make_fixer(ctx, &desc, views, count, &start, &restorer, &fixer);
-    while (result == GSF_OK && !(now.stage == GSF_FIX_RESTORE && now.round == now.rounds && now.window == now.windows) &&
-           now.stage != GSF_FIX_DONE)
+    while (result == GSF_OK && now.stage != GSF_FIX_DONE &&
+           (p->own || !(now.stage == GSF_FIX_RESTORE && now.round == now.rounds && now.window == now.windows)))
         result = gsf_splat_step_fixer(ctx, fixer, &now);
+    if (result == GSF_OK && p->own) result = data_finish(ctx, fixer, &scene, train, count, p);
     gsf_splat_destroy_fixer(ctx, fixer);
     gsf_splat_destroy(ctx, &start);
     gsf_free(ctx, views);
@@ -235,6 +268,7 @@ static gsf_result make_data(gsf_context* ctx, const data_desc* d, uint64_t seed,
     p.s = &s;
     const double help = gsf_draw_uniform(seed, 1, 4);
     p.help = help < 0.5 ? 0.0f : help < 0.75 ? 0.5f : 1.0f;
+    p.own = help < 0.5 ? d->own : NULL;
     gsf_result result = start_world(ctx, &s, &o) ? GSF_OK : gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: no scene", folder);
     if (result == GSF_OK) result = data_run(ctx, d, folder, &o, &p);
     gsf_nn_tensor frames;

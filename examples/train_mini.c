@@ -4,16 +4,17 @@
 
        train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064] [--steps 14000 | --quick] [--resume]
            [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE] [--threads N] [--make-only]
-           [--pixels 216] [--fit 599] [--groups 1] [--better 0] [--int8]
+           [--pixels 216] [--fit 599] [--own FILE] [--groups 1] [--better 0] [--int8]
 
-   --scenes and --check: seeds, such as 1001-1040,1055. DIR gets a file for each (mini_data.h), unless it is there already. The
-   network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16 or, with
-   --int8, all kernels in 8-bit integers. OUT.state: what --resume continues from, written every --save-every steps; a run that
-   was killed and resumed ends with the same bytes, as do runs with other numbers of threads. --quick: 4000 steps, ten minutes
-   on one core. --init starts from the weights of a file. --pixels: longer side of the photos; --fit: step of the last round, of
-   which there are three. --better: share of the samples whose render is partly the truth; with 0.2 the network learns to keep
-   what is right, but repairs less. --groups N: the batch is added up in N parts (training.h), which up to N ranks share: with
-   -DGSF_USE_MPI, compiled by mpicc,
+   --scenes and --check: seeds, such as 1001-1040,1055. DIR gets a file for each (mini_data.h), unless it is there already.
+   The network is trained on the former and measured on the latter. OUT: the moving average of the weights, in bfloat16 or,
+   with --int8, all kernels in 8-bit integers. OUT.state: what --resume continues from, written every --save-every steps; a
+   run that was killed and resumed ends with the same bytes, as do runs with other numbers of threads. --quick: 4000 steps,
+   ten minutes on one core. --init starts from the weights of a file. --pixels: longer side of the photos; --fit: step of the
+   last round, of which there are three. --own: in half of the scenes that are made, the rounds are restored by the weights of
+   FILE, and frames of the splats that result are added. --better: share of the samples whose render is partly the truth; with
+   0.2 the network learns to keep what is right, but repairs less. --groups N: the batch is added up in N parts (training.h),
+   which up to N ranks share: with -DGSF_USE_MPI, compiled by mpicc,
        mpirun -np 2 train_mini ... --groups 2
    writes the bytes of the same command on one rank. OUT.loss.csv and OUT.loss.html: loss of every step, and its curve. */
 #ifndef _POSIX_C_SOURCE
@@ -35,7 +36,7 @@ typedef struct seeds { // ranges of them, both ends included
 } seeds;
 
 typedef struct options {
-    const char *out, *data, *init;
+    const char *out, *data, *init, *own;
     seeds scenes, check;
     int steps, batch, crop, save_every, threads, resume, make_only, int8, pixels, fit, groups;
     uint64_t seed;
@@ -57,6 +58,7 @@ typedef struct training {
     training_ranks ranks;
     training_sum sum;
     training_log log;
+    gsf_restorer own;
 } training;
 
 static double decibels(double square) { return -10.0 * log10(square > 1e-10 ? square : 1e-10); }
@@ -81,7 +83,7 @@ static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
     snprintf(path, sizeof path, "%s/%llu.safetensors", t->o.data, (unsigned long long)seed);
     struct stat there;
     if (stat(path, &there) != 0 && t->ranks.rank == 0) {
-        const data_desc desc = {t->o.data, t->o.pixels, t->o.fit};
+        const data_desc desc = {t->o.data, t->o.pixels, t->o.fit, t->o.own ? &t->own : NULL};
         const gsf_result made = make_data(&t->ctx, &desc, seed, path);
         if (made != GSF_OK) return made;
         fprintf(stderr, "train_mini: scene %llu, %.1f CPU minutes\n", (unsigned long long)seed, training_cpu_minutes());
@@ -97,6 +99,11 @@ static gsf_result open_scene(training* t, size_t index, uint64_t seed) {
 }
 
 static gsf_result open_data(training* t) {
+    const gsf_nn_mini_desc own = {.path = t->o.own, .references = DATA_REFERENCES};
+    if (t->o.own) {
+        const gsf_result result = gsf_nn_make_mini(&t->ctx, &own, &t->own);
+        if (result != GSF_OK) return result;
+    }
     t->scene_count = seed_count(&t->o.scenes);
     t->check_count = seed_count(&t->o.check);
     const size_t all = t->scene_count + t->check_count;
@@ -395,7 +402,8 @@ static gsf_result check(training* t) {
 static int usage(FILE* to) {
     fprintf(to, "usage: train_mini OUT.safetensors --data DIR [--scenes 1001-1060] [--check 1061-1064]\n"
                 "       [--steps 14000 | --quick] [--resume] [--batch 8] [--crop 96] [--rate 0.001] [--seed 1] [--save-every 500] [--init FILE]\n"
-                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--groups 1] [--better 0] [--int8]\n"
+                "       [--threads N] [--make-only] [--pixels 216] [--fit 599] [--own FILE] [--groups 1]\n"
+                "       [--better 0] [--int8]\n"
                 "Makes training data for the restorer mini from seeds, and trains it.\n");
     return to == stdout ? 0 : 2;
 }
@@ -434,6 +442,7 @@ static int parse_options(int argc, char** argv, options* o) {
             const int number = end != value && !*end && x >= 0.0 && x < 1e9;
             if (strcmp(name, "--data") == 0) o->data = value;
             else if (strcmp(name, "--init") == 0) o->init = value;
+            else if (strcmp(name, "--own") == 0) o->own = value;
             else if (strcmp(name, "--scenes") == 0) { if (!parse_seeds(value, &o->scenes)) return 0; }
             else if (strcmp(name, "--check") == 0) { if (!parse_seeds(value, &o->check)) return 0; }
             else if (!number) return 0;
@@ -476,6 +485,7 @@ int main(int argc, char** argv) {
         if (result == GSF_OK) result = check(&t);
     }
     if (result != GSF_OK) fprintf(stderr, "train_mini: %s\n", t.ctx.error);
+    gsf_destroy_restorer(&t.ctx, &t.own);
     training_end_sum(&t.ctx, &t.sum);
     gsf_free(&t.ctx, t.log.losses);
     gsf__mini_end(&t.run);

@@ -53,6 +53,13 @@ awk '/^mean: / { if ($4 < $2 + 0.3) exit 1 }' learned.txt || fail "it has learne
 [ $((3 * $(stat -c %s narrow))) -lt $((2 * $(stat -c %s learned))) ] || fail "8-bit weights are no smaller"
 paste -d' ' learned.txt narrow.txt | awk '/^mean: / { exit ($4 - $10) ^ 2 > 0.05 ^ 2 }' || fail "8-bit weights: $(cat narrow.txt)"
 
+for threads in 1 3; do # its own frames in the rounds, and frames of the splats at the end
+    "$train" none --data "own$threads" --scenes 4 --check 0 --pixels 48 --fit 17 --crop 32 --own learned --make-only \
+        --threads $threads > /dev/null 2> own.txt || fail "--own: $(tail -1 own.txt)"
+done
+cmp own1/4.safetensors own3/4.safetensors || fail "frames of --own depend on the number of threads"
+[ "$(stat -c %s own1/4.safetensors)" -gt "$(stat -c %s data/4.safetensors)" ] || fail "--own adds no frames"
+
 scene=data/scenes/4
 for threads in 1 2; do
     "$gsfix" fix "$scene" --out "fix$threads" --views 3 --iterations 40 --init tracks --restorer mini:learned --filtered \
