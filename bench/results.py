@@ -186,6 +186,11 @@ FAMILIES = [("ddim", COLORS[5]), ("dpmpp", COLORS[1]), ("unipc", COLORS[3]), ("g
             ("no guidance", COLORS[1]), ("strength", COLORS[5]), ("block cache", COLORS[3]), ("", COLORS[6])]
 
 
+def label_box(x, y, label, left, under):  # of 10 pixels' type, beside a point: left, top, right, bottom
+    start, base = x - 6 - 6 * len(label) if left else x + 6, y + 12 if under else y - 5
+    return start, base - 8, start + 6 * len(label), base + 2
+
+
 def write_pipeline(path, rows):  # error (logarithmic) over seconds; one panel for steps, one for skips
     panels = [("Solvers and steps: error against the converged path", pipeline_of(rows, "steps")),
               ("Work skipped in 50 steps: error against the full run", pipeline_of(rows, "skips"))]
@@ -210,7 +215,7 @@ def write_pipeline(path, rows):  # error (logarithmic) over seconds; one panel f
             out.append('<line x1="%.1f" y1="%d" x2="%.1f" y2="%d" stroke="#ddd"/>' % (x, top, x, bottom))
             out.append('<text x="%.1f" y="%d" text-anchor="middle">%g s</text>' % (x, bottom + 16, k * unit))
         out.append('<text x="%d" y="%d">%s</text>' % (x0, top - 12, title))
-        lines, exact = collections.OrderedDict(), []
+        lines, exact, taken = collections.OrderedDict(), [], []  # taken: boxes of labels, none over another
         for name, seconds, error in points:
             if error <= 0.0:
                 exact.append("%s %s s" % (name, short(seconds)))
@@ -223,11 +228,18 @@ def write_pipeline(path, rows):  # error (logarithmic) over seconds; one panel f
                 out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
                            % (" ".join("%.1f,%.1f" % p[:2] for p in line), color))
             for n, (x, y, label) in enumerate(line):
-                # labels of neighbouring lines and of single points must not overlap, and none may leave the panel
-                below = (k if family else n) % 2 or x + 6 + 6 * len(label) > x0 + width + 12
                 out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
+                below = (k if family else n) % 2 == 1  # preferred: labels of neighbouring lines on either side
+                sides = sorted(((left, under) for left in (False, True) for under in (False, True)),
+                               key=lambda side: (side != (below, below), side[0] != below))
+                boxes = [label_box(x, y, label, left, under) for left, under in sides]
+                free = [i for i, box in enumerate(boxes) if box[0] >= x0 and box[2] <= x0 + width + 12 and
+                        not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken)]
+                best = free[0] if free else 0
+                taken.append(boxes[best])
+                left, under = sides[best]
                 out.append('<text x="%.1f" y="%.1f" font-size="10" text-anchor="%s" fill="%s">%s</text>'
-                           % (x + (-6 if below else 6), y + (12 if below else -5), "end" if below else "start", color, label))
+                           % (x + (-6 if left else 6), y + (12 if under else -5), "end" if left else "start", color, label))
             out.append('<rect x="%d" y="%d" width="10" height="10" fill="%s"/><text x="%d" y="%d">%s</text>'
                        % (x0 + width + 12, top + 8 + 16 * k, color, x0 + width + 26, top + 17 + 16 * k,
                           family or "number formats"))
