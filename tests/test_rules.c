@@ -174,7 +174,7 @@ static void warp_case_init(warp_case* w, int count, double shift, const float de
             for (int c = 0; c < 3; c++) w->color[k][3 * i + c] = c == k ? 1.0f : 0.0f;
             w->depth[k][i] = depth[k];
             w->score[k][i] = (uint8_t)percent[k];
-            w->inv_z[k * PIXELS + i] = 1.0f / depth[k];
+            w->inv_z[k * PIXELS + i] = depth[k] > 0.0f ? 1.0f / depth[k] : 0.0f;
         }
     }
     w->carrier.references = w->references;
@@ -202,28 +202,41 @@ static int warp_shows_near(int near_percent, int far_percent) {
     return rgb[0] > 0.5f;
 }
 
-// References moved by `shift` show red and green at depth 1, the frame grey at depth `shown`. Returns whether the grey stays,
-// then with confidence 0.
-static int warp_keeps(int count, double shift, float shown, int opaque) {
+// Of `count` references, the nearest `seers` (1 or 2) are moved by `shift` and show red and green at depth 1 with this score,
+// the frame grey at depth `shown`. Returns the confidence: 0 if and only if the grey stays.
+static float warp_confidence(int count, int seers, double shift, float shown, int opaque, int percent) {
     static warp_case w;
-    const float depth[2] = {1.0f, 1.0f};
-    const int percent[2] = {100, 100};
-    warp_case_init(&w, count, shift, depth, percent);
+    const float depth[2] = {1.0f, seers > 1 ? 1.0f : 0.0f};
+    const int percents[2] = {percent, percent};
+    warp_case_init(&w, count, shift, depth, percents);
     float rgb[3] = {0.2f, 0.2f, 0.2f};
     const float confidence = warp_middle(&w, shown, opaque, rgb);
-    const int kept = rgb[0] == 0.2f && rgb[1] == 0.2f && rgb[2] == 0.2f;
-    CHECK(kept == (confidence == 0.0f));
-    return kept;
+    CHECK((confidence == 0.0f) == (rgb[0] == 0.2f && rgb[1] == 0.2f && rgb[2] == 0.2f));
+    return confidence;
 }
 
-// What lies behind the frame's surface is hidden, unless a reference looks through that surface, as those do that have it in
-// their image, or it is nearly transparent, or its splats were made from few photos.
+static int warp_keeps(int count, int seers, double shift, float shown, int opaque) {
+    return warp_confidence(count, seers, shift, shown, opaque, 100) == 0.0f;
+}
+
+// What lies behind the frame's surface is hidden, unless it is nearly transparent or references look through that surface, as
+// those do that have it in their image: one of many, two of few photos, which are trusted by half then.
 static void test_warp_hidden(void) {
-    CHECK(warp_keeps(6, 0.4, 0.5f, 1) && warp_keeps(8, -0.4, 0.5f, 1));
-    CHECK(!warp_keeps(6, 0.0, 0.5f, 1) && !warp_keeps(6, 0.1, 0.5f, 1)); // looked through
-    CHECK(!warp_keeps(5, 0.4, 0.5f, 1) && !warp_keeps(2, 0.4, 0.5f, 1)); // few photos
-    CHECK(!warp_keeps(6, 0.4, 0.5f, 0) && !warp_keeps(6, 0.4, 0.0f, 1)); // transparent, or nothing there
-    CHECK(!warp_keeps(6, 0.4, 2.0f, 1) && !warp_keeps(6, 0.4, 0.95f, 1)); // in front of the frame's, or hardly behind it
+    CHECK(warp_keeps(6, 2, 0.4, 0.5f, 1) && warp_keeps(8, 2, -0.4, 0.5f, 1) && warp_keeps(5, 2, 0.4, 0.5f, 1));
+    CHECK(!warp_keeps(6, 2, 0.0, 0.5f, 1) && !warp_keeps(6, 2, 0.1, 0.5f, 1)); // looked through
+    CHECK(warp_keeps(5, 2, 0.4, 0.93f, 1) && !warp_keeps(6, 2, 0.4, 0.93f, 1)); // by a smaller difference, of few photos
+    CHECK(!warp_keeps(5, 2, 0.1, 0.5f, 1) && warp_keeps(5, 1, 0.0, 0.5f, 1) && !warp_keeps(6, 1, 0.0, 0.5f, 1));
+    for (int count = 5; count <= 6; count++) {
+        CHECK(!warp_keeps(count, 2, 0.4, 0.5f, 0) && !warp_keeps(count, 2, 0.4, 0.0f, 1)); // transparent, or nothing there
+        CHECK(!warp_keeps(count, 2, 0.4, 2.0f, 1) && !warp_keeps(count, 2, 0.4, 0.97f, 1)); // in front, or hardly behind
+        const float verified = warp_confidence(count, 2, 0.0, 2.0f, 1, 100);
+        const float floater = warp_confidence(count, 2, 0.0, 0.5f, 1, 100);
+        CHECK_NEAR(floater, (count < 6 ? 0.5f : 1.0f) * verified, 1e-6);
+        CHECK(verified > 0.0f);
+        // what nothing verifies counts no more where the surface is looked through
+        CHECK(warp_confidence(count, 2, 0.0, 0.5f, 1, 30) == warp_confidence(count, 2, 0.0, 2.0f, 1, 30));
+        CHECK(warp_confidence(count, 2, 0.4, 0.5f, 1, 30) == 0.0f);
+    }
 }
 
 static void test_warp_groups(void) {
