@@ -13782,9 +13782,11 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
        supported   Where only the splats vouch for the depth, a carried photo would displace all detail by the depth error
                    and bring its shading along. The residual, photo - render at the photo's own camera, is what the splats
                    do not yet explain; it is added to the render.
-       behind      What references show behind an opaque surface of the frame is hidden by it, as a rule: the render is kept.
-                   That surface is most likely a floater if none of them shows it and one, with few photos two, look through
-                   it. With few photos, what is behind counts half then, and needs a smaller difference in depth to be behind.
+       floaters    A residual would keep a floater: where two references look through the surface that the frame shows and
+                   none sees it there, the colours are taken even so, unless photos are few.
+       hidden      What references show far behind the surface of the frame is most likely hidden by it, unless one of them
+                   looks through that surface: the render is kept. With few photos, what is verified is hidden by surfaces
+                   little in front of it, too, unless two references look through them; then it counts half.
    Blending is weighted by score and angle; confidence falls where the candidates disagree. Pixels that no reference
    reaches keep the render and get confidence 0, so that they are not trained on.
    In the repair loop it shares the loop's carrier; elsewhere it makes one of its own from the references. If a reference has
@@ -13798,13 +13800,15 @@ typedef struct gsf__warp {
 #define GSF__WARP_ANGLE 0.2f            // radians: a reference whose viewing direction differs by this weighs exp(-1/2)
 #define GSF__WARP_GROUP_SHARE 0.35f     // share of the heaviest group's weight that a nearer group needs to occlude it
 #define GSF__WARP_TRUST 0.5f            // total weight below which a residual is attenuated
+#define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
+#define GSF__WARP_BEHIND_MAX 2.0f
+#define GSF__WARP_HIDDEN 1.1f           // depth ratio from which a warped surface may be hidden by the frame's
 #define GSF__WARP_OPAQUE 0.5f           // alpha from which the frame's surface hides others
-#define GSF__WARP_BEHIND 1.1f           // depth ratio from which a carried surface is behind the frame's, unless photos are few
-#define GSF__WARP_FLOATER 0.5f          // confidence of colours in place of a floater, with few photos
+#define GSF__WARP_FLOATER 0.5f          // confidence of what is verified behind a floater, with few photos
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
 enum { GSF__WARP_HALVED = 128 };        // photos of at least this many pixels a side are repaired at half their size
-enum { GSF__WARP_FEW = 6 };             // fewer photos are few
+enum { GSF__WARP_FEW = 6 };             // fewer photos are few: their verified colours replace the render everywhere
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                                   gsf_restorer_info* out) {
@@ -13901,7 +13905,7 @@ typedef struct gsf__warp_job {
 } gsf__warp_job;
 
 // Returns how many references look through the surface that the frame shows at camera depth `z`: 0 if one of them shows a
-// surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges).
+// surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges). Two make it a floater.
 static int gsf__warp_count_through(const gsf__warp_job* job, const gsf_camera* camera, int32_t x, int32_t y, double z) {
     int through = 0;
     double point[3], u, v, depth;
@@ -13968,10 +13972,13 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
                     candidates[i].sample.score >= 0.01f * (float)GSF__CARRY_VERIFIED;
     const int few = job->carrier->count < GSF__WARP_FEW;
     const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
-    const float limit = few ? 1.0f + GSF__CARRY_DEPTH_TOLERANCE : GSF__WARP_BEHIND;
-    const int behind = opaque && shown > 0.0f && front > shown * limit;
-    if (behind && gsf__warp_count_through(job, camera, x, y, (double)shown) < (few ? 2 : 1)) return 0.0f;
-    const int colors = (verified && (few || !agrees)) || !job->carrier->has_residuals;
+    const int behind = !few && !verified && front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
+    const int hides = opaque && shown > 0.0f;
+    const int hidden = hides && (few ? verified && front > shown && !agrees : front > shown * GSF__WARP_HIDDEN);
+    const int through = hidden || behind ? gsf__warp_count_through(job, camera, x, y, (double)shown) : 0;
+    if (hidden && through < (few ? 2 : 1)) return 0.0f;
+    const int refuted = behind && through >= 2;
+    const int colors = refuted || (verified && (few || !agrees)) || !job->carrier->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
         const gsf__warp_candidate* at = candidates + i;
@@ -13991,7 +13998,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
         rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
-    return (verified && behind && few ? GSF__WARP_FLOATER : verified || total > 1.0f ? 1.0f : total) * agreement;
+    return (few && hidden ? GSF__WARP_FLOATER : verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
 static void gsf__warp_row(void* arg, size_t row, int32_t worker) {
