@@ -13785,8 +13785,8 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
        floaters    A residual would keep a floater: where two references look through the surface that the frame shows and
                    none sees it there, the colours are taken even so, unless photos are few.
        hidden      What references show far behind the surface of the frame is most likely hidden by it, unless one of them
-                   looks through that surface: the render is kept. With few photos, what is verified is hidden by surfaces
-                   little in front of it, too, unless two references look through them; then it counts half.
+                   looks through that surface: the render is kept. With few photos, surfaces little in front hide, too, and
+                   two references have to look through them; what is behind counts half then.
    Blending is weighted by score and angle; confidence falls where the candidates disagree. Pixels that no reference
    reaches keep the render and get confidence 0, so that they are not trained on.
    In the repair loop it shares the loop's carrier; elsewhere it makes one of its own from the references. If a reference has
@@ -13803,8 +13803,9 @@ typedef struct gsf__warp {
 #define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
 #define GSF__WARP_BEHIND_MAX 2.0f
 #define GSF__WARP_HIDDEN 1.1f           // depth ratio from which a warped surface may be hidden by the frame's
+#define GSF__WARP_HIDDEN_FEW 1.04f      // the same with few photos
 #define GSF__WARP_OPAQUE 0.5f           // alpha from which the frame's surface hides others
-#define GSF__WARP_FLOATER 0.5f          // confidence of what is verified behind a floater, with few photos
+#define GSF__WARP_FLOATER 0.5f          // confidence of what is behind a floater, with few photos
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
 enum { GSF__WARP_HALVED = 128 };        // photos of at least this many pixels a side are repaired at half their size
@@ -13973,8 +13974,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const int few = job->carrier->count < GSF__WARP_FEW;
     const int agrees = fabsf(front - shown) <= GSF__CARRY_DEPTH_TOLERANCE * shown;
     const int behind = !few && !verified && front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX;
-    const int hides = opaque && shown > 0.0f;
-    const int hidden = hides && (few ? verified && front > shown && !agrees : front > shown * GSF__WARP_HIDDEN);
+    const int hidden = opaque && shown > 0.0f && front > shown * (few ? GSF__WARP_HIDDEN_FEW : GSF__WARP_HIDDEN);
     const int through = hidden || behind ? gsf__warp_count_through(job, camera, x, y, (double)shown) : 0;
     if (hidden && through < (few ? 2 : 1)) return 0.0f;
     const int refuted = behind && through >= 2;
@@ -13998,7 +13998,8 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
         rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
-    return (few && hidden ? GSF__WARP_FLOATER : verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
+    const float trust = few && hidden ? GSF__WARP_FLOATER : 1.0f;
+    return trust * (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
 static void gsf__warp_row(void* arg, size_t row, int32_t worker) {
