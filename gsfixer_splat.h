@@ -13803,7 +13803,7 @@ typedef struct gsf__warp {
 #define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
 #define GSF__WARP_BEHIND_MAX 2.0f
 #define GSF__WARP_HIDDEN 1.1f           // depth ratio from which a warped surface may be hidden by the frame's
-#define GSF__WARP_HIDDEN_FEW 1.04f      // the same with few photos
+#define GSF__WARP_HIDDEN_FEW (1.0f + GSF__CARRY_DEPTH_TOLERANCE) // the same with few photos: any other surface
 #define GSF__WARP_OPAQUE 0.5f           // alpha from which the frame's surface hides others
 #define GSF__WARP_FLOATER 0.5f          // confidence of what is behind a floater, with few photos
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too

@@ -222,7 +222,8 @@ static int warp_keeps(int count, int seers, double shift, float shown, int opaqu
 // What lies behind the frame's surface is hidden, unless it is nearly transparent or references look through that surface, as
 // those do that have it in their image: one of many, two of few photos, which are trusted by half then.
 static void test_warp_hidden(void) {
-    CHECK(warp_keeps(6, 2, 0.4, 0.5f, 1) && warp_keeps(8, 2, -0.4, 0.5f, 1) && warp_keeps(5, 2, 0.4, 0.5f, 1));
+    CHECK(warp_keeps(6, 2, 0.4, 0.5f, 1) && warp_keeps(8, 2, -0.4, 0.5f, 1));
+    CHECK(warp_keeps(5, 2, 0.4, 0.5f, 1) && warp_keeps(2, 2, 0.4, 0.5f, 1) && !warp_keeps(6, 2, 0.4, 0.95f, 1));
     CHECK(!warp_keeps(6, 2, 0.0, 0.5f, 1) && !warp_keeps(6, 2, 0.1, 0.5f, 1)); // looked through
     CHECK(warp_keeps(5, 2, 0.4, 0.93f, 1) && !warp_keeps(6, 2, 0.4, 0.93f, 1)); // by a smaller difference, of few photos
     CHECK(!warp_keeps(5, 2, 0.1, 0.5f, 1) && warp_keeps(5, 1, 0.0, 0.5f, 1) && !warp_keeps(6, 1, 0.0, 0.5f, 1));
