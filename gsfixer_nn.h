@@ -40,8 +40,8 @@
    PROCESSORS  Elementwise kernels are written once over the lanes of gsfixer.h, next to a scalar reference. The inner
                loops of GEMM, GEMV, attention and convolution are hand-written for AVX2 and AVX-512. 8-bit layers use
                byte dot products (VNNI); linear layers and attention use bfloat16 dot products if the `bf16` member of
-               their descriptor is set. gsf_context.cpu_level selects the level; results differ between levels by the
-               rounding of float32 sums.
+               their descriptor is set and the level has them. gsf_context.cpu_level selects the level; results differ
+               between levels by the rounding of float32 sums.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
@@ -389,8 +389,8 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
     double spatial_scale, temporal_scale;                   // of the sine-cosine position embedding
     double norm_eps;
     gsf_nn_weights weights;
-    int32_t bf16;                                           // the `bf16` member of its linear layers and attention;
-                                                            // may be changed at any time
+    int32_t bf16;                                           // the `bf16` member of its linear layers and attention, for
+                                                            // speed: see GSF_CPU_AVX512_BF16; may be changed at any time
     void* nets;                                             // private
 } gsf_nn_transformer;
 

@@ -1753,9 +1753,9 @@ int main(int argc, char** argv) {
         }
     }
     gsf_context ctx;
-    (void)bench_context(&ctx, GSF_CPU_AUTO, 1);
+    (void)bench_context(&ctx, GSF_CPU_AVX512_BF16, 1); // lowered to the machine's highest
     bench_best_level = ctx.cpu_level;
-    (void)bench_context(&ctx, o.level, 1);
+    (void)bench_context(&ctx, o.level ? o.level : bench_best_level, 1);
     o.level = ctx.cpu_level; // limited to what the machine supports
     const size_t size = (size_t)1 << (o.quick ? 28 : 30); // larger than any cache
     char* memory = (char*)bench_alloc(&ctx, size, 1);

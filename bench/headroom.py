@@ -2,8 +2,8 @@
 """How much repair could gain: runs of `gsfix fix` with restorers that know the truth.
 
     bench/headroom.py SCENE... --out DIR [--views 3] [--seeds 3] [--iterations 900] [--max-size N]
-                      [--rows none,warp,...] [--arm NAME="ARGS"] [--common "ARGS"] [--truth auto|trace|model]
-                      [--jobs N] [--build build] [--tables]
+                      [--rows none,warp,...] [--arm NAME[@PROGRAM]="ARGS"] [--base none] [--common "ARGS"]
+                      [--truth auto|trace|model] [--jobs N] [--build build] [--tables]
     bench/headroom.py --quick --out DIR     a small scene that it makes, one seed: 25 s of CPU time
 
 Each row is `gsfix fix SCENE --views K --seed S` with another restorer, path or schedule:
@@ -23,7 +23,9 @@ Each row is `gsfix fix SCENE --views K --seed S` with another restorer, path or 
 
 Where the restored frames have no confidence they are not trained on. --arm adds a row; in its ARGS, `--restorer oracle:ROW`
 stands for the oracle of the row warp, carried, masked, blurred, seen or truth: --arm far="--restorer oracle:truth --path
-far.json". --common adds arguments to all rows; where both have --set, the row's settings come last.
+far.json". PROGRAM is another build of gsfix. --base is the row whose figures gains, also the oracle's, are counted from: with
+--arm v010@OLD/gsfix="--restorer none" --base v010 the share is that of the way from version 0.1.0 without repair to the oracle
+of today. --common adds arguments to all rows; where both have --set, the row's settings come last.
 
 For a scene of make_scene the truth is ray-traced (--truth trace). For any other it is rendered from a model trained on all
 photos except the held-out ones, for --model-iterations steps (--truth model). A pixel is seen if its surface point is at
@@ -31,7 +33,7 @@ most 1.02 (ray-traced) or 1.05 times (model) as deep in one of the training phot
 
 A run that has left its result.json is not repeated, so an interrupted call can be continued. DIR/headroom.csv has one row
 per run. DIR/headroom.md, also printed, has three tables per scene: PSNR of the rows on the held-out views, with gains over
-`none` paired by seed and their standard errors; the frames of each round against the truth; and how far held-out views
+the base paired by seed and their standard errors; the frames of each round against the truth; and how far held-out views
 are from each path. With several scenes the means over them follow. --tables only writes the tables of the runs there are.
 Needs only the standard library.
 """
@@ -329,7 +331,7 @@ def rounds_of(log):
     return [dict(rounds[key]) for key in sorted(rounds)]
 
 
-def fix(options, job, arm):
+def fix(options, job, arm, program):
     scene, views, _, seed = job
     folder, out = views_folder(scene, views), job_folder(job)
     split = read_json(os.path.join(folder, "split.json"))
@@ -339,13 +341,14 @@ def fix(options, job, arm):
     config.update(row=oracle, log=log_path, photo_truth=os.path.abspath(os.path.join(folder, "photo_truth")),
                   cache=os.path.abspath(cache_of(job)), flags=flags_of(config) + ["--sigma", str(options.sigma)])
     write_json(config_path, config)
-    command = [options.gsfix, "fix", scene.folder, "--out", os.path.join(out, "run"), "--restart", "--views", views,
+    command = [program or options.gsfix, "fix", scene.folder, "--out", os.path.join(out, "run"), "--restart", "--views", views,
                "--seed", str(seed), "--threads", "1", "--iterations", str(options.iterations),
                "--masks", os.path.join(folder, "masks")]
     _, cpu = run(command + size_of(options) + arguments)
     metrics = read_json(os.path.join(out, "run", "metrics.json"))
     row = {figure: metrics.get(figure) for figure in FIGURES}
-    row.update(psnr_unseen=unseen_psnr(metrics, split["seen"]), splats=metrics["splats"], cpu_seconds=cpu, arguments=arm)
+    row.update(psnr_unseen=unseen_psnr(metrics, split["seen"]), splats=metrics["splats"], cpu_seconds=cpu, arguments=arm,
+               program=program)
     if os.path.exists(log_path):  # else all windows were skipped, or no oracle was used
         with open(log_path) as file:
             log = [json.loads(line) for line in file]
@@ -360,14 +363,14 @@ def cache_of(job):
     return os.path.join(views_folder(scene, views), "truth_on_paths", "seed%d" % seed)
 
 
-def work(options, job, arm):
+def work(options, job, arm, program):
     out, done = job_folder(job), result_of(job)
-    if done and done["arguments"] != arm:
-        sys.exit("%s: made with other arguments: %s" % (out, done["arguments"]))
+    if done and (done["arguments"], done.get("program")) != (arm, program):
+        sys.exit("%s: made with other arguments: %s %s" % (out, done.get("program") or "", done["arguments"]))
     if not done:
         shutil.rmtree(out, ignore_errors=True)  # left by a stopped call
         os.makedirs(out)
-        write_json(os.path.join(out, "result.json"), fix(options, job, arm))
+        write_json(os.path.join(out, "result.json"), fix(options, job, arm, program))
         if not options.keep:
             shutil.rmtree(os.path.join(out, "run"))
     return result_of(job)
@@ -397,18 +400,18 @@ def share(gain, whole):
     return "%.0f %%" % (100.0 * gain / whole) if math.isfinite(gain) and math.isfinite(whole) and whole > 0.0 else "-"
 
 
-def figure_lines(found, arms):
+def figure_lines(found, arms, base):
     lines = ["| row | PSNR | seen | unseen | gain | gain seen | gain unseen | of the oracle's | seen | runs |",
              "|---|---|---|---|---|---|---|---|---|---|"]
-    whole = {f: mean_and_error(gains_of(found.get("truth", {}), found.get("none", {}), f))[0] for f in GAINS}
-    for arm, _ in arms:
+    whole = {f: mean_and_error(gains_of(found.get("truth", {}), found.get(base, {}), f))[0] for f in GAINS}
+    for arm in arms:
         rows = found.get(arm)
         if not rows:
             continue
-        gains = {f: mean_and_error(gains_of(rows, found.get("none", {}), f)) for f in GAINS}
+        gains = {f: mean_and_error(gains_of(rows, found.get(base, {}), f)) for f in GAINS}
         cells = [number(mean_of(rows, f)) for f in GAINS]
-        cells += ["" if arm == "none" else with_error(*gains[f]) for f in GAINS]
-        cells += ["" if arm == "none" else share(gains[f][0], whole[f]) for f in GAINS[:2]]
+        cells += ["" if arm == base else with_error(*gains[f]) for f in GAINS]
+        cells += ["" if arm == base else share(gains[f][0], whole[f]) for f in GAINS[:2]]
         lines.append("| %s | %s | %d |" % (arm, " | ".join(cells), len(rows)))
     return lines
 
@@ -427,7 +430,7 @@ def round_cells(sums):
 def frame_lines(found, arms):
     lines = ["| row | round | render | restored | render, reached | restored, reached | reached | seen | confidence |",
              "|---|---|---|---|---|---|---|---|---|"]
-    for arm, _ in arms:
+    for arm in arms:
         done = [row["rounds"] for row in found.get(arm, {}).values() if row.get("rounds")]
         for k in range(max((len(rounds) for rounds in done), default=0)):
             sums = collections.Counter()
@@ -449,7 +452,7 @@ def path_lines(found, arms):
     lines = ["| path | distance, mean | largest | degrees, mean | largest |",
              "|---|---|---|---|---|"]
     paths = {}
-    for arm, arguments in arms:
+    for arm, (arguments, _) in arms.items():
         for row in found.get(arm, {}).values():
             if row.get("distances"):
                 paths.setdefault(path_name(arm, arguments), {}).setdefault(arm, []).extend(row["distances"])
@@ -461,20 +464,20 @@ def path_lines(found, arms):
     return lines
 
 
-def scene_means(by_scene, arms):
+def scene_means(by_scene, arms, base):
     """Gains averaged over the scenes, and of the shares of the means."""
     lines = ["| row | gain | gain seen | gain unseen | of the oracle's | seen | scenes |",
              "|---|---|---|---|---|---|---|"]
-    gains = {arm: {f: [] for f in GAINS} for arm, _ in arms}
+    gains = {arm: {f: [] for f in GAINS} for arm in arms}
     for found in by_scene:
-        for arm, _ in arms:
+        for arm in arms:
             for f in GAINS:
-                mean = mean_and_error(gains_of(found.get(arm, {}), found.get("none", {}), f))[0]
+                mean = mean_and_error(gains_of(found.get(arm, {}), found.get(base, {}), f))[0]
                 if math.isfinite(mean):
                     gains[arm][f].append(mean)
     whole = {f: mean_and_error(gains["truth"][f])[0] if "truth" in gains else float("nan") for f in GAINS}
-    for arm, _ in arms:
-        if arm == "none" or not gains[arm]["psnr"]:
+    for arm in arms:
+        if arm == base or not gains[arm]["psnr"]:
             continue
         means = {f: mean_and_error(gains[arm][f]) for f in GAINS}
         complete = "truth" in gains and len(gains[arm]["psnr"]) == len(gains["truth"]["psnr"])
@@ -484,15 +487,15 @@ def scene_means(by_scene, arms):
     return lines
 
 
-def write_tables(options, scenes, arms):
-    lines, by_views = [], {}
+def write_tables(options, scenes):
+    lines, by_views, arms, base = [], {}, options.arms, options.base
     with open(os.path.join(options.out, "headroom.csv"), "w", newline="") as file:
         table = csv.writer(file)
         table.writerow(("scene", "views", "row", "seed") + FIGURES + ("splats", "cpu_seconds"))
         for scene in scenes:
             for views in options.views:
                 found = {}
-                for arm, _ in arms:
+                for arm in arms:
                     for seed in options.seeds:
                         row = result_of((scene, views, arm, seed))
                         if row:
@@ -502,12 +505,12 @@ def write_tables(options, scenes, arms):
                 if not found:
                     continue
                 by_views.setdefault(views, []).append(found)
-                lines += ["### %s, %s photos" % (scene.name, views), ""] + figure_lines(found, arms)
+                lines += ["### %s, %s photos" % (scene.name, views), ""] + figure_lines(found, arms, base)
                 lines += ["", FRAMES_TEXT, ""] + frame_lines(found, arms)
                 lines += ["", PATHS_TEXT, ""] + path_lines(found, arms) + [""]
     for views, found in by_views.items():
         if len(found) > 1:
-            lines += ["### Means over the scenes, %s photos" % views, ""] + scene_means(found, arms) + [""]
+            lines += ["### Means over the scenes, %s photos" % views, ""] + scene_means(found, arms, base) + [""]
     text = "\n".join(lines)
     with open(os.path.join(options.out, "headroom.md"), "w") as file:
         file.write(text)
@@ -529,6 +532,7 @@ def read_options():
     parser.add_argument("--sigma", type=float, default=2.0)
     parser.add_argument("--rows", default=",".join(name for name, _ in ROWS))
     parser.add_argument("--arm", action="append", default=[])
+    parser.add_argument("--base", default="none")
     parser.add_argument("--common", default="")
     parser.add_argument("--truth", choices=("auto", "trace", "model"), default="auto")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -543,13 +547,18 @@ def read_options():
     unknown = [row for row in rows if row not in known]
     if unknown:
         parser.error("no row " + unknown[0])
-    added = [tuple(text.split("=", 1)) for text in options.arm]
-    if any(len(arm) != 2 or arm[0] in known for arm in added):
-        parser.error("--arm: expected a new NAME=\"ARGS\"")
-    options.arms = [(row, known[row]) for row in rows] + added
     options.views = options.views.split(",")
     for program in ("gsfix", "oracle", "make_scene"):
         setattr(options, program, os.path.abspath(os.path.join(options.build, program)))
+    options.arms = {row: (known[row], None) for row in rows}
+    for text in options.arm:
+        head, equals, arguments = text.partition("=")
+        name, _, program = head.partition("@")
+        if not equals or name in known:
+            parser.error("--arm: expected a new NAME=\"ARGS\" or NAME@PROGRAM=\"ARGS\"")
+        options.arms[name] = (arguments, os.path.abspath(program) if program else None)
+    if options.base not in options.arms and options.base != "none":
+        parser.error("--base: no row " + options.base)
     return options
 
 
@@ -578,13 +587,13 @@ def scene_list(options):
 def run_all(options, scenes):
     """Scene by scene, seed by seed, so that the truth of a path is soon no longer needed."""
     left, lock = collections.Counter(), threading.Lock()
-    jobs = [((scene, views, name, seed), arm) for scene in scenes for views in options.views for seed in options.seeds
-            for name, arm in options.arms]
-    for job, _ in jobs:
+    jobs = [((scene, views, name, seed),) + arm for scene in scenes for views in options.views for seed in options.seeds
+            for name, arm in options.arms.items()]
+    for job, _, _ in jobs:
         left[cache_of(job)] += 1
 
-    def one(job, arm):
-        row = work(options, job, arm)
+    def one(job, arm, program):
+        row = work(options, job, arm, program)
         with lock:
             left[cache_of(job)] -= 1
             if not left[cache_of(job)] and not options.keep:
@@ -596,14 +605,14 @@ def run_all(options, scenes):
         for views in options.views:
             prepare_views(options, scene, views)
     with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        futures = {pool.submit(one, job, arm): job for job, arm in jobs}
+        futures = {pool.submit(one, *job): job[0] for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             scene, views, name, seed = futures[future]
             row = future.result()
             print("%s K=%s %-12s seed %d: psnr %.3f seen %.3f, %.1f CPU s" % (
                 scene.name, views, name, seed, row["psnr"], row["psnr_seen"] or float("nan"), row["cpu_seconds"]),
                 flush=True)
-            write_tables(options, scenes, options.arms)
+            write_tables(options, scenes)
 
 
 def main():
@@ -617,7 +626,7 @@ def main():
     scenes = scene_list(options)
     if not options.tables:
         run_all(options, scenes)
-    print(write_tables(options, scenes, options.arms))
+    print(write_tables(options, scenes))
 
 
 if __name__ == "__main__":

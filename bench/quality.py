@@ -158,7 +158,8 @@ def prepare(options):
     if not os.path.exists(model):
         shutil.rmtree(os.path.dirname(model), ignore_errors=True)
         run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--restart", "--views", "all",
-             "--restorer", "none", "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations), "--threads", str(options.jobs)])
+             "--restorer", "none", "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations),
+             "--threads", str(options.jobs)])
     for views in options.views:
         masks = masks_of(options, views)
         if not os.path.isdir(masks):

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Held-out quality of settings of `gsfix fix` on many scenes: scenes x view counts x arms x seeds, paired by scene and seed.
 
-    bench/scenes.py SCENE... --out DIR --arm NAME="ARGS" [--arm NAME="ARGS" ...] [--views 3] [--seeds 1] [--size "--max-size 240"]
-                    [--common "ARGS"] [--gsfix build/gsfix] [--jobs 1] [--base NAME] [--tables]
+    bench/scenes.py SCENE... --out DIR --arm NAME[@PROGRAM]="ARGS" ... [--base NAME] [--views 3] [--seeds 1] [--jobs 1]
+                    [--size "--max-size 240"] [--common "ARGS"] [--gsfix build/gsfix] [--per-scene] [--tables]
 
-Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`. An arm may name another build of the program with
-NAME@PROGRAM="ARGS"; {scene} in ARGS is the name of the scene's folder. The tables give, for each view count, PSNR and SSIM over all pixels and CPU seconds per scene, and the
-differences from the arm --base (the first one by default): per scene, in the mean with its standard error over scenes, and
-for the scene that loses most. A run that has left result.json is not repeated; --tables runs nothing. Needs only the
-standard library.
+Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`. PROGRAM is another build of the program; {scene} in ARGS is
+the name of the scene's folder. The tables give, for each view count, PSNR and SSIM over all pixels and CPU seconds per scene,
+and the differences from the arm --base (the first one by default): in the mean over scenes with its standard error, for the
+scene that loses most, and with --per-scene for each. A run that has left result.json is not repeated; --tables runs nothing.
+Needs only the standard library.
 """
 import argparse
 import concurrent.futures
@@ -37,8 +37,9 @@ def work(options, job, program, extra):
     if read_json(path) is None:
         scene, views, _, seed = job
         shutil.rmtree(out, ignore_errors=True)  # left by an interrupted call
-        command = shlex.split(options.prefix) + [program, "fix", scene, "--out", os.path.join(out, "run"), "--restart", "--views", views, "--seed", str(seed),
-                   "--threads", "1", "--eval-every", "1000000", "--checkpoint-every", "1000000"]
+        command = shlex.split(options.prefix) + [
+            program, "fix", scene, "--out", os.path.join(out, "run"), "--restart", "--views", views, "--seed", str(seed),
+            "--threads", "1", "--eval-every", "1000000", "--checkpoint-every", "1000000"]
         _, cpu = run(command + shlex.split(options.size) + shlex.split(options.common) +
                      shlex.split(extra.replace("{scene}", name_of(scene))))
         metrics = read_json(os.path.join(out, "run", "metrics.json"))
@@ -52,10 +53,16 @@ def mean(values):
     return sum(values) / len(values) if values else float("nan")
 
 
+def result_of(options, job):
+    return read_json(os.path.join(folder_of(options, job), "result.json"))
+
+
 def table(options, views, arms):
-    found = {(scene, arm): {seed: row for seed in range(1, options.seeds + 1)
-                            for row in [read_json(os.path.join(folder_of(options, (scene, views, arm, seed)), "result.json"))] if row}
-             for scene in options.scenes for arm in arms}
+    found = {}
+    for scene in options.scenes:
+        for arm in arms:
+            rows = {seed: result_of(options, (scene, views, arm, seed)) for seed in range(1, options.seeds + 1)}
+            found[scene, arm] = {seed: row for seed, row in rows.items() if row}
     lines = ["### %s photos" % views, "", "| scene | " + " | ".join(arms) + " |", "|---|" + "---|" * len(arms)]
     for scene in options.scenes:
         cells = []
@@ -95,7 +102,7 @@ def tables(options, arms):
             for views in options.views:
                 for arm in arms:
                     for seed in range(1, options.seeds + 1):
-                        row = read_json(os.path.join(folder_of(options, (scene, views, arm, seed)), "result.json"))
+                        row = result_of(options, (scene, views, arm, seed))
                         if row:
                             rows.writerow([name_of(scene), views, arm, seed] + [row[f] for f in FIGURES])
     text = "\n".join(line for views in options.views for line in table(options, views, arms))

@@ -46,8 +46,9 @@ static inline int test_check_result(gsf_context* ctx, int actual, int expected, 
     return actual == expected;
 }
 
-// Zeroes and initialises a context; the environment variable GSF_TEST_CPU=scalar|avx2|... forces a CPU level. To install
-// hooks, call test_context_zero, fill them in and call gsf_init_context.
+// Zeroes and initialises a context of the machine's highest level, which AUTO may pass over; the environment variable
+// GSF_TEST_CPU=scalar|avx2|... forces another one. To install hooks, call test_context_zero, fill them in and call
+// gsf_init_context.
 static inline void test_context_zero(gsf_context* ctx) {
     memset(ctx, 0, sizeof *ctx);
     const char* level = getenv("GSF_TEST_CPU");
@@ -56,6 +57,9 @@ static inline void test_context_zero(gsf_context* ctx) {
 }
 static inline void test_context_init(gsf_context* ctx) {
     test_context_zero(ctx);
+#if GSF__X86
+    if (ctx->cpu_level == GSF_CPU_AUTO) ctx->cpu_level = GSF_CPU_AVX512_BF16;
+#endif
     if (gsf_init_context(ctx) != GSF_OK) { fprintf(stderr, "gsf_init_context: %s\n", ctx->error); exit(2); }
 }
 #endif

@@ -57,7 +57,7 @@ headroom() { # OUT SETTINGS ...
 }
 all_rows() {
     headroom out "rounds=1,windows=1,window_frames=6" --iterations 40 "$@" \
-        --arm "early=--restorer oracle:truth --set first_round=5"
+        --arm "early=--restorer oracle:truth --set first_round=5" --arm "other@$build/gsfix=--restorer none"
 }
 all_rows
 cat > check.py << 'PY'
@@ -71,8 +71,9 @@ results = glob.glob(folder + "/rows/*/seed1/result.json")
 rows = {path.split(os.sep)[-3]: json.load(open(path)) for path in results}
 everywhere = {"truth", "densify", "ellipse", "interpolate", "capture", "early"}
 oracles = everywhere | {"warp8", "carried", "masked", "blurred", "seen"}
-assert set(rows) == oracles | {"none", "warp"}, sorted(rows)
-for name in ("none", "warp"):
+assert set(rows) == oracles | {"none", "warp", "other"}, sorted(rows)
+assert rows["other"]["psnr"] == rows["none"]["psnr"] and rows["other"]["program"], rows["other"]
+for name in ("none", "warp", "other"):
     assert "rounds" not in rows[name] and rows[name]["psnr"] > 8.0, name
 for name in oracles:
     sums, = rows[name]["rounds"]
@@ -116,6 +117,10 @@ cp out/headroom.csv before.csv
 touch mark
 all_rows
 [ -z "$(find out/runs/*/K3 -newer mark)" ] && cmp before.csv out/headroom.csv || fail "a second call repeats runs"
+all_rows --tables --base other
+grep -q '^| none |.*| +0.00 | +0.00 | +0.00 | 0 % | 0 % | 1 |$' log || fail "gains are not over the base"
+grep -q '^| other |.*|  |  |  |  |  | 1 |$' log || fail "gains of the base itself"
+if (all_rows --base nothing) > /dev/null; then fail "takes a base that is no row"; fi
 if (all_rows --sigma 3) > /dev/null; then fail "mixes runs of different settings"; fi
 grep -q "begun with other settings" log || fail "does not name the cause"
 
