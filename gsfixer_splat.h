@@ -13808,7 +13808,7 @@ typedef struct gsf__warp {
 #define GSF__WARP_FLOATER 0.5f          // confidence of what is behind a floater, with few photos
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
-enum { GSF__WARP_HALVED = 128 };        // photos of at least this many pixels a side are repaired at half their size
+enum { GSF__WARP_HALVED = 256 };        // photos of at least this many pixels a side are repaired at half their size
 enum { GSF__WARP_FEW = 6 };             // fewer photos are few: their verified colours replace the render everywhere
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -13824,7 +13824,8 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
         // adds less to them. Measured in bench/QUALITY.md
         out->lambda = 0.5f;
         out->lambda_views = 6;
-        // Whole frames cost twice as much and gain the same; the photos show all detail. Measured in bench/QUALITY.md
+        // Whole frames cost more and gain the same, as the photos show all detail; halved ones of small photos are too coarse.
+        // Measured in bench/QUALITY.md
         if (width >= GSF__WARP_HALVED && height >= GSF__WARP_HALVED) out->frame_scale = 0.5f;
     }
     const int32_t count = warp->own.count > 0 ? warp->own.count : 3;

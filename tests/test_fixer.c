@@ -79,12 +79,12 @@ static void test_warp(gsf_context* ctx) {
     one_frame frame;
     one_frame_init(&frame, &cameras[2], gray, out_color, out_confidence);
     CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
-    for (int32_t side = 127; side <= 129; side++) { // large photos are repaired at half their size
+    for (int32_t side = 255; side <= 257; side++) { // large photos are repaired at half their size
         gsf_restorer_info info;
         memset(&info, 0, sizeof info);
         info.struct_size = sizeof info;
         CHECK_OK(ctx, warp.query_fn(warp.user, ctx, 17, side, 500, &info));
-        CHECK(info.frame_scale == (side < 128 ? 0.0f : 0.5f));
+        CHECK(info.frame_scale == (side < 256 ? 0.0f : 0.5f));
         CHECK(info.lambda == 0.5f && info.lambda_views == 6);
     }
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
