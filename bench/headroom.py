@@ -552,9 +552,8 @@ def read_options():
         setattr(options, program, os.path.abspath(os.path.join(options.build, program)))
     options.arms = {row: (known[row], None) for row in rows}
     for text in options.arm:
-        head, equals, arguments = text.partition("=")
-        name, _, program = head.partition("@")
-        if not equals or name in known:
+        name, program, arguments = runs.split_arm(text)
+        if "=" not in text or name in known:
             parser.error("--arm: expected a new NAME=\"ARGS\" or NAME@PROGRAM=\"ARGS\"")
         options.arms[name] = (arguments, os.path.abspath(program) if program else None)
     if options.base not in options.arms and options.base != "none":

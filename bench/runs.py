@@ -1,5 +1,5 @@
-"""What the benches of whole runs, quality.py and headroom.py, share: commands with their CPU time, result files that are
-complete or absent, means. Needs only the standard library.
+"""What the benches of whole runs, quality.py, headroom.py and scenes.py, share: arms, commands with their CPU time, result files
+that are complete or absent, means. Needs only the standard library.
 """
 import concurrent.futures
 import json
@@ -7,6 +7,13 @@ import math
 import os
 import subprocess
 import sys
+
+
+def split_arm(text):
+    """Name, program ("" unless given) and arguments of an arm, NAME=ARGS or NAME@PROGRAM=ARGS."""
+    head, _, arguments = text.partition("=")
+    name, _, program = head.partition("@")
+    return name, program, arguments
 
 
 def run(command, **environment):

@@ -17,7 +17,7 @@ import os
 import shlex
 import shutil
 
-from runs import mean_and_error, read_json, run, write_json
+from runs import mean_and_error, read_json, run, split_arm, write_json
 
 FIGURES = ("psnr", "ssim", "splats", "cpu_seconds")
 
@@ -131,8 +131,7 @@ def main():
     options.views = options.views.split(",")
     arms = {}
     for text in options.arm:
-        name, _, extra = text.partition("=")
-        name, _, program = name.partition("@")
+        name, program, extra = split_arm(text)
         arms[name] = (program or options.gsfix, extra)
     options.base = options.base or next(iter(arms))
     os.makedirs(options.out, exist_ok=True)
