@@ -347,14 +347,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_from_points(gsf_context* ctx, co
 
 /* Points on which the photos of a few posed views agree, by PatchMatch multi-view stereo, coarse to fine: every pixel of
    every view holds a plane (inverse depth and slope). Planes are propagated to neighbours and perturbed at random, and
-   kept if they improve the match of the photo's window in the other views (weighted normalised cross-correlation, with
-   view weights per pixel). A pixel is accepted if its match is good and it passes a consistency check: the plane of at
-   least one other view at the corresponding pixel leads back to it. Accepted pixels are merged over the views and
-   thinned. Zero is the default of every field. Pixels are those of the working size. */
+   kept if they improve the match of the photo's window in the other views (weighted normalised cross-correlation, of
+   colours while coarse and of grey at the finest level, with view weights per pixel). A pixel is accepted if its match is
+   good and it passes a consistency check: the plane of at least one other view at the corresponding pixel leads back to
+   it. Accepted pixels are merged over the views and thinned. Zero is the default of every field. Pixels are those of the
+   working size. */
 typedef struct gsf_dense_desc {
     uint64_t seed;
     int32_t max_size;        // longer side of the working images; larger photos are shrunk; 0 = 640
-    int32_t levels;          // maximum number of pyramid levels; 0 = 3 (while at least 40 pixels are left)
+    int32_t levels;          // maximum number of pyramid levels; 0 = 3 (while at least 48 pixels are left)
     int32_t iterations;      // per level; 0 = 2. Two more at the coarsest level; half as many at the finest, followed by
                              // two that include the depth consistency of the views in the cost
     int32_t sources;         // other views that each view is matched with, at most 8; 0 = 4
@@ -6255,7 +6256,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
    A pixel (x,y) then maps to another view by (X,Y,Z) = M (x,y,1) + t (1/z), so computing the homography of a window
    takes nine multiply-adds.
 
-       prepare   scale photos to the working sizes (grey, each texel packed with its 2x2 neighbours in one word);
+       prepare   scale photos to the working sizes (each texel of a channel packed with its 2x2 neighbours in one word);
                  choose the source views of every view
        match     per level, coarse to fine: initial planes, then iterations of (red pixels, black pixels)
        fuse      keep pixels that pass the consistency checks in other views; thin them out by marking the pixels
@@ -6270,7 +6271,8 @@ enum {
     GSF__DENSE_SAMPLES = 256,
     GSF__DENSE_ROWS = 4,       // rows per chunk
     GSF__DENSE_PLANES = 9,     // candidates: the pixel's own plane and one from each of eight regions
-    GSF__DENSE_MIN_SIDE = 40,  // minimum width and height of the coarsest level, pixels
+    GSF__DENSE_MIN_SIDE = 40,  // minimum width and height of a photo, pixels
+    GSF__DENSE_COARSEST = 48,  // the same of a coarser level: windows of fewer pixels show too little
 };
 
 #define GSF__DENSE_BAD 2.0f        // cost of a plane that cannot be evaluated
@@ -6307,17 +6309,19 @@ typedef struct gsf__dense_window { // samples of the matching window, padded wit
 } gsf__dense_window;
 
 typedef struct gsf__dense_patch { // the window around one pixel of the reference
-    float weight[GSF__DENSE_SAMPLES], value[GSF__DENSE_SAMPLES]; // value: grey minus center
-    float center, weight_sum;
+    float weight[GSF__DENSE_SAMPLES], value[3][GSF__DENSE_SAMPLES]; // value: of each channel, minus center
+    float center[3], weight_sum;
 } gsf__dense_patch;
 
 typedef struct gsf__dense_warp { // homography of a window: (X,Y,Z) at its centre, and its change per pixel in x and y
     float middle[3], along_x[3], along_y[3];
-    const uint32_t* texels;
+    const uint32_t* texels;  // of the first channel that is matched
+    size_t stride;           // texels between channels
     int32_t width, height;
 } gsf__dense_warp;
 
-// Matching cost, 0..2: 1 - normalised cross-correlation between a patch and the other photo sampled through a warp.
+// Matching cost, 0..2: 1 - normalised cross-correlation between a patch and the other photo sampled through a warp. With
+// colours, covariance and variances are sums over the channels, and a difference of the windows' mean colours is added.
 typedef float (*gsf__dense_cost_fn)(const gsf__dense_window* window, const gsf__dense_patch* patch,
                                     const gsf__dense_warp* warp);
 
@@ -6332,12 +6336,13 @@ struct gsf__dense_job {
     const gsf_scene* scene;
     gsf_dense_desc desc;
     const uint8_t* keep;
-    gsf__dense_cost_fn cost_fn;
+    gsf__dense_cost_fn cost_fns[2]; // of grey, of colours
     gsf__dense_window window;
     size_t view_count;
     gsf__dense_view* views;
     size_t pixel_count;            // of all views at this level
-    uint32_t* texels;
+    int channels;                  // that are matched: 3 (red, green, blue) at coarse levels, 1 (grey) at the finest
+    uint32_t* texels;              // (1,pixels) grey or (4,pixels) grey, red, green, blue
     gsf__dense_plane* planes;
     gsf__dense_plane* others;      // copy of the planes before a geometric iteration, NULL in other iterations
     float* source_costs;           // (pixels,GSF__DENSE_SOURCES)
@@ -6441,16 +6446,37 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
 
 // ---- matching cost
 
-// sums, all weighted: weight; value and square in the reference; value and square in the other photo; product.
-static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sums[6]) {
-    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // at least half of the weight is outside
-    const float inv = 1.0f / sums[0], mean_r = sums[1] * inv, mean_s = sums[3] * inv;
-    const float var_r = sums[2] * inv - mean_r * mean_r, var_s = sums[4] * inv - mean_s * mean_s;
-    if (!(var_r > GSF__DENSE_MIN_VARIANCE && var_s > GSF__DENSE_MIN_VARIANCE)) return GSF__DENSE_BAD;
-    const float cost = 1.0f - (sums[5] * inv - mean_r * mean_s) / sqrtf(var_r * var_s);
+enum { // weighted sums over a window: weight; squares in the reference and in the other photo, products, over all channels
+    GSF__DENSE_W, GSF__DENSE_RR, GSF__DENSE_SS, GSF__DENSE_RS,
+    GSF__DENSE_R, GSF__DENSE_S, // of the first channel's values in the reference and in the other photo; others follow
+    GSF__DENSE_SUMS = 16,
+};
+
+#define GSF__DENSE_TINT 0.15f       // most that a difference of mean colours adds to the cost,
+#define GSF__DENSE_TINT_RANGE 40.0f // from this many grey levels on
+
+static float gsf__dense_correlate(const gsf__dense_patch* patch, const float* sums, int channels) {
+    if (!(sums[GSF__DENSE_W] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // at least half of the weight is outside
+    const float inv = 1.0f / sums[GSF__DENSE_W], least = GSF__DENSE_MIN_VARIANCE * (float)channels;
+    float var_r = sums[GSF__DENSE_RR] * inv, var_s = sums[GSF__DENSE_SS] * inv, both = sums[GSF__DENSE_RS] * inv, tint = 0.0f;
+    for (int c = 0; c < channels; c++) {
+        const float mean_r = sums[GSF__DENSE_R + 2 * c] * inv, mean_s = sums[GSF__DENSE_S + 2 * c] * inv;
+        var_r -= mean_r * mean_r;
+        var_s -= mean_s * mean_s;
+        both -= mean_r * mean_s;
+        tint += fabsf(mean_r - mean_s);
+    }
+    if (!(var_r > least && var_s > least)) return GSF__DENSE_BAD;
+    float cost = 1.0f - both / sqrtf(var_r * var_s);
+    if (channels > 1) {
+        tint *= 1.0f / (GSF__DENSE_TINT_RANGE * (float)channels);
+        cost += GSF__DENSE_TINT * (tint < 1.0f ? tint : 1.0f);
+    }
     return cost < 0.0f ? 0.0f : cost < GSF__DENSE_BAD ? cost : GSF__DENSE_BAD;
 }
 
+#define gsf__dense_add GSF__V(gsf__dense_add)
+#define gsf__dense_match GSF__V(gsf__dense_match)
 #define gsf__dense_part GSF__V(gsf__dense_part)
 
 #define GSF__KERNELS "gsfixer_splat.h"
@@ -6463,21 +6489,40 @@ static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sum
 #ifdef GSF__KERNELS_STEREO
 
 // Partial sum i of the sums k, k + 1, ... k + GSF__LANES - 1, which have been transposed.
-GSF__V_INLINE gsf__vf gsf__dense_part(gsf__vf sums[8 / GSF__LANES][8], int k, int i) {
+GSF__V_INLINE gsf__vf gsf__dense_part(gsf__vf sums[8 / GSF__LANES][GSF__DENSE_SUMS], int k, int i) {
     return sums[i / GSF__LANES][k + i % GSF__LANES];
+}
+
+// Adds samples of one channel, read at the texels `at` with the fractions fu and fv, to the sums.
+GSF__V_INLINE void gsf__dense_add(const gsf__dense_patch* patch, int i, int channel, const uint32_t* texels, gsf__vi at,
+                                  gsf__vf fu, gsf__vf fv, gsf__vf weight, gsf__vf* sum) {
+    const gsf__vi texel = gsf__vi_gather(texels, at);
+    const gsf__vf a = gsf__vi_floats(gsf__vi_byte(texel, 0)), b = gsf__vi_floats(gsf__vi_byte(texel, 1));
+    const gsf__vf c = gsf__vi_floats(gsf__vi_byte(texel, 2)), d = gsf__vi_floats(gsf__vi_byte(texel, 3));
+    const gsf__vf top = a + fu * (b - a), bottom = c + fu * (d - c);
+    const gsf__vf s = top + fv * (bottom - top) - gsf__v_set(patch->center[channel]);
+    const gsf__vf r = gsf__v_load(patch->value[channel] + i), wr = weight * r, ws = weight * s;
+    sum[GSF__DENSE_RR] += wr * r;
+    sum[GSF__DENSE_SS] += ws * s;
+    sum[GSF__DENSE_RS] += wr * s;
+    sum[GSF__DENSE_R + 2 * channel] += wr;
+    sum[GSF__DENSE_S + 2 * channel] += ws;
 }
 
 // One pixel of the window per lane. Eight partial sums for any number of lanes, and no fused multiply-add, so that all
 // instruction sets give the same bits.
-GSF__V_KERNEL float GSF__V(gsf__dense_cost)(const gsf__dense_window* window, const gsf__dense_patch* patch,
-                                            const gsf__dense_warp* warp) {
+GSF__V_INLINE float gsf__dense_match(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                     const gsf__dense_warp* warp, int channels) {
     const float *base = warp->middle, *along_x = warp->along_x, *along_y = warp->along_y;
-    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f), center = gsf__v_set(patch->center);
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f);
     const gsf__vf u_max = gsf__v_set((float)(warp->width - 1)), v_max = gsf__v_set((float)(warp->height - 1));
-    gsf__vf sums[8 / GSF__LANES][8]; // indexed by constants with AVX2, so that they stay in registers
+    const int used = channels > 1 ? GSF__DENSE_SUMS : 8; // of the sums
+    gsf__vf sums[8 / GSF__LANES][GSF__DENSE_SUMS]; // indexed by constants with AVX2, so that they stay in registers
     for (int part = 0; part < 8 / GSF__LANES; part++) {
         gsf__vf* sum = sums[part];
         sum[0] = sum[1] = sum[2] = sum[3] = sum[4] = sum[5] = sum[6] = sum[7] = zero;
+        if (channels == 1) continue;
+        sum[8] = sum[9] = sum[10] = sum[11] = sum[12] = sum[13] = sum[14] = sum[15] = zero;
     }
     for (int i = 0; i < window->count; i += GSF__LANES) {
         const gsf__vf dx = gsf__v_load(window->dx + i), dy = gsf__v_load(window->dy + i);
@@ -6493,29 +6538,34 @@ GSF__V_KERNEL float GSF__V(gsf__dense_cost)(const gsf__dense_window* window, con
         v = gsf__v_keep(inside, v);
         const gsf__vi iu = gsf__v_truncate(u), iv = gsf__v_truncate(v);
         const gsf__vf fu = u - gsf__vi_floats(iu), fv = v - gsf__vi_floats(iv);
-        const gsf__vi texel = gsf__vi_gather(warp->texels, gsf__vi_add(gsf__vi_mul(iv, gsf__vi_set(warp->width)), iu));
-        const gsf__vf a = gsf__vi_floats(gsf__vi_byte(texel, 0)), b = gsf__vi_floats(gsf__vi_byte(texel, 1));
-        const gsf__vf c = gsf__vi_floats(gsf__vi_byte(texel, 2)), d = gsf__vi_floats(gsf__vi_byte(texel, 3));
-        const gsf__vf top = a + fu * (b - a), bottom = c + fu * (d - c);
-        const gsf__vf s = top + fv * (bottom - top) - center, r = gsf__v_load(patch->value + i);
-        const gsf__vf weight = gsf__v_keep(inside, gsf__v_load(patch->weight + i)), wr = weight * r, ws = weight * s;
+        const gsf__vi at = gsf__vi_add(gsf__vi_mul(iv, gsf__vi_set(warp->width)), iu);
+        const gsf__vf weight = gsf__v_keep(inside, gsf__v_load(patch->weight + i));
         gsf__vf* sum = sums[i / GSF__LANES % (8 / GSF__LANES)];
-        sum[0] += weight;
-        sum[1] += wr;
-        sum[2] += wr * r;
-        sum[3] += ws;
-        sum[4] += ws * s;
-        sum[5] += wr * s;
+        sum[GSF__DENSE_W] += weight;
+        gsf__dense_add(patch, i, 0, warp->texels, at, fu, fv, weight, sum);
+        if (channels == 1) continue;
+        gsf__dense_add(patch, i, 1, warp->texels + warp->stride, at, fu, fv, weight, sum);
+        gsf__dense_add(patch, i, 2, warp->texels + 2 * warp->stride, at, fu, fv, weight, sum);
     }
-    float totals[8];
-    for (int k = 0; k < 8; k += GSF__LANES) {
+    float totals[GSF__DENSE_SUMS];
+    for (int k = 0; k < used; k += GSF__LANES) {
         for (int part = 0; part < 8 / GSF__LANES; part++) gsf__v_transpose(sums[part] + k); // now a sum per lane
         gsf__v_store(totals + k, ((gsf__dense_part(sums, k, 0) + gsf__dense_part(sums, k, 1)) +
                                   (gsf__dense_part(sums, k, 2) + gsf__dense_part(sums, k, 3))) +
                                  ((gsf__dense_part(sums, k, 4) + gsf__dense_part(sums, k, 5)) +
                                   (gsf__dense_part(sums, k, 6) + gsf__dense_part(sums, k, 7))));
     }
-    return gsf__dense_correlate(patch, totals);
+    return gsf__dense_correlate(patch, totals, channels);
+}
+
+GSF__V_KERNEL float GSF__V(gsf__dense_cost_grey)(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                                 const gsf__dense_warp* warp) {
+    return gsf__dense_match(window, patch, warp, 1);
+}
+
+GSF__V_KERNEL float GSF__V(gsf__dense_cost_color)(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                                  const gsf__dense_warp* warp) {
+    return gsf__dense_match(window, patch, warp, 3);
 }
 
 #endif // GSF__KERNELS_STEREO
@@ -6536,8 +6586,10 @@ static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* w
 }
 
 // Returns 0 if the window has too little texture to match.
-static int gsf__dense_make_patch(const gsf__dense_window* window, const gsf__dense_view* view, const uint32_t* texels,
-                                 int x, int y, gsf__dense_patch* patch) {
+static int gsf__dense_make_patch(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y,
+                                 gsf__dense_patch* patch) {
+    const gsf__dense_window* window = &job->window;
+    const uint32_t* texels = job->texels + view->first;
     const int center = (int)(texels[y * view->width + x] & 255u);
     float sum = 0.0f, first = 0.0f, second = 0.0f;
     for (int i = 0; i < window->count; i++) {
@@ -6549,13 +6601,22 @@ static int gsf__dense_make_patch(const gsf__dense_window* window, const gsf__den
             value = (float)difference;
         }
         patch->weight[i] = weight;
-        patch->value[i] = value;
+        patch->value[0][i] = value;
         sum += weight;
         first += weight * value;
         second += weight * value * value;
     }
-    patch->center = (float)center;
+    patch->center[0] = (float)center;
     patch->weight_sum = sum;
+    for (int c = 0; c < 3 && job->channels == 3; c++) {
+        const uint32_t* channel = texels + (size_t)(c + 1) * job->pixel_count;
+        const int middle = (int)(channel[y * view->width + x] & 255u);
+        patch->center[c] = (float)middle;
+        for (int i = 0; i < window->count; i++) {
+            const int at = (y + (int)window->dy[i]) * view->width + x + (int)window->dx[i];
+            patch->value[c][i] = patch->weight[i] > 0.0f ? (float)((int)(channel[at] & 255u) - middle) : 0.0f;
+        }
+    }
     return second * sum - first * first > GSF__DENSE_MIN_VARIANCE * sum * sum;
 }
 
@@ -6625,7 +6686,7 @@ static int gsf__dense_begin(gsf__dense_pixel* p, const gsf__dense_job* job, cons
         const float* m = view->sources[s].m;
         for (int k = 0; k < 3; k++) p->base[s][k] = m[3 * k] * (float)x + m[3 * k + 1] * (float)y + m[3 * k + 2];
     }
-    return gsf__dense_make_patch(&job->window, view, job->texels + view->first, x, y, &p->patch);
+    return gsf__dense_make_patch(job, view, x, y, &p->patch);
 }
 
 static float gsf__dense_cost(const gsf__dense_pixel* p, int s, const gsf__dense_plane* plane) {
@@ -6637,14 +6698,15 @@ static float gsf__dense_cost(const gsf__dense_pixel* p, int s, const gsf__dense_
         warp.along_x[k] = source->m[3 * k] + source->t[k] * plane->gx;
         warp.along_y[k] = source->m[3 * k + 1] + source->t[k] * plane->gy;
     }
-    warp.texels = p->job->texels + other->first;
+    warp.texels = p->job->texels + other->first + (p->job->channels == 3 ? p->job->pixel_count : 0);
+    warp.stride = p->job->pixel_count;
     warp.width = other->width;
     warp.height = other->height;
     if (!(warp.middle[2] > 0.0f)) return GSF__DENSE_BAD;
     const float u = warp.middle[0], v = warp.middle[1], z = warp.middle[2];
     const float right = ((float)other->width - 0.5f) * z, bottom = ((float)other->height - 0.5f) * z;
     if (!(u >= -0.5f * z && u <= right && v >= -0.5f * z && v <= bottom)) return GSF__DENSE_BAD;
-    return p->job->cost_fn(&p->job->window, &p->patch, &warp);
+    return p->job->cost_fns[p->job->channels == 3](&p->job->window, &p->patch, &warp);
 }
 
 // Forward-backward reprojection error, at most 3 pixels: the pixel is mapped to source s by `plane` and back by the
@@ -7051,11 +7113,13 @@ static void gsf__dense_free_level(gsf__dense_job* job) {
     job->seeds = NULL;
 }
 
-static void gsf__dense_texels(const gsf__dense_view* view, uint32_t* texels) {
+// Texels of one channel: 0 grey, 1 red, 2 green, 3 blue.
+static void gsf__dense_texels(const gsf__dense_view* view, int channel, uint32_t* texels) {
     const uint8_t* rgb = (const uint8_t*)view->color.data;
     const int32_t width = view->width, height = view->height;
     for (size_t i = 0; i < (size_t)width * (size_t)height; i++)
-        texels[i] = (77u * rgb[3 * i] + 150u * rgb[3 * i + 1] + 29u * rgb[3 * i + 2] + 128u) >> 8;
+        texels[i] = channel ? rgb[3 * i + (size_t)channel - 1]
+                            : (77u * rgb[3 * i] + 150u * rgb[3 * i + 1] + 29u * rgb[3 * i + 2] + 128u) >> 8;
     for (int32_t y = 0; y < height; y++) // packing in place: low bytes keep each texel's own grey
         for (int32_t x = 0; x < width; x++) {
             const int32_t right = x + 1 < width, below = y + 1 < height ? width : 0;
@@ -7163,7 +7227,9 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dense points: %zu pixels in all are too many", job->pixel_count);
     gsf__arena* arena = &job->level_arena;
     job->planes = (gsf__dense_plane*)gsf_alloc(ctx, job->pixel_count, sizeof(gsf__dense_plane));
-    job->texels = (uint32_t*)gsf__arena_alloc(arena, job->pixel_count, sizeof(uint32_t));
+    job->channels = level ? 3 : 1;
+    const int planes = level ? 4 : 1; // grey weighs the window's samples, also where colours are matched
+    job->texels = (uint32_t*)gsf__arena_alloc(arena, job->pixel_count, (size_t)planes * sizeof(uint32_t));
     job->source_costs = (float*)gsf__arena_alloc(arena, job->pixel_count, GSF__DENSE_SOURCES * sizeof(float));
     job->blocks = (gsf__dense_block*)gsf__arena_alloc(arena, job->block_count, sizeof(gsf__dense_block));
     if (with_seeds) job->seeds = (float*)gsf__arena_alloc_zeroed(arena, job->pixel_count, sizeof(float));
@@ -7171,7 +7237,8 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
     size_t block = 0;
     for (size_t i = 0; i < job->view_count; i++) {
         gsf__dense_view* view = job->views + i;
-        gsf__dense_texels(view, job->texels + view->first);
+        for (int c = 0; c < planes; c++)
+            gsf__dense_texels(view, c, job->texels + (size_t)c * job->pixel_count + view->first);
         for (int32_t row = 0; row < view->height; row += GSF__DENSE_ROWS, block++) {
             job->blocks[block].view = (uint32_t)i;
             job->blocks[block].row = row;
@@ -7537,7 +7604,8 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     job->scene = scene;
     job->desc = d;
     job->keep = keep;
-    job->cost_fn = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
+    job->cost_fns[0] = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__dense_cost_grey);
+    job->cost_fns[1] = GSF__LANE_KERNEL_OF(ctx->cpu_level, gsf__dense_cost_color);
     gsf__dense_make_window(&d, &job->window);
     double start = gsf__seconds();
     gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
@@ -7550,7 +7618,7 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
         for (size_t i = 0; i < job->view_count; i++) {
             int32_t width, height;
             gsf__dense_size(&job->scene->views[job->views[i].index].camera, d.max_size, levels, &width, &height);
-            fits &= width >= GSF__DENSE_MIN_SIDE && height >= GSF__DENSE_MIN_SIDE;
+            fits &= width >= GSF__DENSE_COARSEST && height >= GSF__DENSE_COARSEST;
         }
         if (!fits) break;
     }

@@ -30,6 +30,7 @@ gsfixer_splat.h|test_rules|warp: one of few photos that looks through makes a fl
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/
 gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max_normal_angle = 40\.0f/d.max_normal_angle = 60.0f/
 gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
+gsfixer_splat.h|test_stereo|dense points: coarse levels match grey|s/job->channels = level \? 3 : 1/job->channels = 1/
 gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/(basis\[10\] = gsf__v_set\()2\.890611442640554f/${1}-2.890611442640554f/
 gsfixer_splat.h|golden_splat|densification splits what it should clone|s/<= clone_log \? GSF__CLONE : GSF__SPLIT/<= clone_log ? GSF__SPLIT : GSF__CLONE/
 gsfixer_splat.h|golden_splat|opacity reset raises opacities|s/if \(group->value\[i\] > logit\)/if (group->value[i] < logit)/

@@ -50,7 +50,7 @@ static double texture(double u, double v) { // three octaves of smooth noise, [0
     return sum / 3.0;
 }
 
-enum { WIDTH = 96, HEIGHT = 80, VIEWS = 3 };
+enum { WIDTH = 96, HEIGHT = 96, VIEWS = 3 }; // twice the smallest coarser level
 
 typedef struct plane_scene {
     gsf_scene scene;
@@ -106,11 +106,60 @@ static void make_plane(plane_scene* s, double tilt, double contrast, double offs
     }
 }
 
+// Replaces the plane's texture by noisy stripes whose grey repeats every 8 pixels. Unless `hue` is 0, they have different
+// hues of the same grey.
+static void paint_stripes(plane_scene* s, double hue) {
+    for (int i = 0; i < VIEWS; i++)
+        for (int y = 0; y < HEIGHT; y++)
+            for (int x = 0; x < WIDTH; x++) {
+                double spot[3];
+                plane_depth(s, &s->views[i].camera, x + 0.5, y + 0.5, spot);
+                const double noise = gsf_draw_normal(3, (uint64_t)i, (uint64_t)(y * WIDTH + x));
+                const double grey = 128.0 + 40.0 * sin(spot[0] * 2.0 * 3.14159265358979 / 0.4) + 8.0 * noise;
+                const double red = hue * (texture(spot[0] * 1.5 + 100.0, spot[1] * 1.5 + 100.0) - 0.5);
+                uint8_t* rgb = (uint8_t*)s->views[i].image.data + 3 * (y * WIDTH + x);
+                rgb[0] = (uint8_t)(grey + red + 0.5);
+                rgb[1] = (uint8_t)(grey - red * 77.0 / 150.0 + 0.5);
+                rgb[2] = (uint8_t)(grey + 0.5);
+            }
+}
+
 static void free_plane(plane_scene* s) {
     for (int i = 0; i < VIEWS; i++) gsf_destroy_image(&ctx, &s->views[i].image);
 }
 
 static const uint32_t all_views[VIEWS] = {0, 1, 2};
+
+// Share of all pixels whose depth is accepted and right to 2 %.
+static double right_share(const plane_scene* s) {
+    gsf_dense dense;
+    gsf_dense_desc desc = {0};
+    size_t right = 0;
+    double at[3];
+    desc.want_maps = 1;
+    if (!CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s->scene, all_views, VIEWS, NULL, &desc, &dense, NULL))) return 0.0;
+    for (size_t i = 0; i < dense.map_count; i++)
+        for (int k = 0; k < WIDTH * HEIGHT; k++) {
+            const gsf_camera* camera = &dense.maps[i].camera;
+            const double z = plane_depth(s, camera, k % WIDTH + 0.5, k / WIDTH + 0.5, at);
+            right += fabs((double)dense.maps[i].depth[k] / z - 1.0) < 0.02;
+        }
+    gsf_splat_destroy_dense(&ctx, &dense);
+    return (double)right / (VIEWS * WIDTH * HEIGHT);
+}
+
+// Where grey repeats, colours tell which match is the right one.
+static void test_colors(void) {
+    plane_scene s;
+    make_plane(&s, 0.0, 220.0, 0.0);
+    paint_stripes(&s, 0.0);
+    const double grey = right_share(&s);
+    paint_stripes(&s, 160.0);
+    const double colored = right_share(&s);
+    printf("stripes: %.3f right with their hues, %.3f without\n", colored, grey);
+    CHECK(grey < 0.5 && colored > 0.7);
+    free_plane(&s);
+}
 
 static void check_plane(double tilt, double offset) {
     plane_scene s;
@@ -546,6 +595,7 @@ int main(void) {
     check_plane(0.0, 0.0);
     check_plane(0.7, 0.0);
     check_plane(-0.9, 1e6);
+    test_colors();
     test_angles();
     test_masked();
     test_nothing_to_see();
