@@ -13852,6 +13852,8 @@ static gsf_result gsf__carry_for_window(void* user, gsf_context* ctx, int32_t fr
                    do not yet explain; it is added to the render.
        floaters    A residual would keep a floater: where two references look through the surface that the frame shows and
                    none sees it there, the colours are taken even so, unless photos are few.
+       in front    What references show in front of the frame's surface counts a tenth: the splats are trained on photos that
+                   look through there, and with many photos its depth is mostly wrong.
        hidden      What references show far behind the surface of the frame is most likely hidden by it, unless one of them
                    looks through that surface: the render is kept. With few photos, surfaces little in front hide, too, and
                    two references have to look through them; what is behind counts half then.
@@ -13873,6 +13875,7 @@ typedef struct gsf__warp {
 #define GSF__WARP_HIDDEN 1.1f           // depth ratio from which a warped surface may be hidden by the frame's
 #define GSF__WARP_HIDDEN_FEW (1.0f + GSF__CARRY_DEPTH_TOLERANCE) // the same with few photos: any other surface
 #define GSF__WARP_OPAQUE 0.5f           // alpha from which the frame's surface hides others
+#define GSF__WARP_IN_FRONT 0.1f         // confidence of what is in front of the frame's surface
 #define GSF__WARP_FLOATER 0.5f          // confidence of what is behind a floater, with few photos
 #define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
 enum { GSF__WARP_NEAREST = 4 };         // number of references carried into a frame
@@ -14067,7 +14070,8 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
         rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
-    const float trust = few && hidden ? GSF__WARP_FLOATER : 1.0f;
+    const int in_front = opaque && front < shown * (1.0f - GSF__CARRY_DEPTH_TOLERANCE);
+    const float trust = in_front ? GSF__WARP_IN_FRONT : few && hidden ? GSF__WARP_FLOATER : 1.0f;
     return trust * (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 

@@ -25,6 +25,7 @@ gsfixer_splat.h|test_rules|photos and restored views averaged together|s/densify
 gsfixer_splat.h|test_rules|restored views counted as photos|s/model->grad_sum\[k\]\[i\] \+= gsf__visit_grad/model->grad_sum[0][i] += gsf__visit_grad/
 gsfixer_splat.h|test_rules|an origin from 2000 extents on|s/distance > 1000\.0 \* extent/distance > 2000.0 * extent/
 gsfixer_splat.h|test_rules|warp: a nearer group needs half the weight|s/(define GSF__WARP_GROUP_SHARE) 0\.35f/$1 0.5f/
+gsfixer_splat.h|test_rules|warp: what is in front of the frame's surface is trusted|s/trust = in_front \? GSF__WARP_IN_FRONT :/trust = in_front ? 1.0f :/
 gsfixer_splat.h|test_rules|warp: what photos look through hides, too|s/if \(hidden && through < \(few \? 2 : 1\)\)/if (hidden)/
 gsfixer_splat.h|test_rules|warp: one of few photos that looks through makes a floater|s/\(few \? 2 : 1\)/1/
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/

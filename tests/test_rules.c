@@ -219,8 +219,9 @@ static int warp_keeps(int count, int seers, double shift, float shown, int opaqu
     return warp_confidence(count, seers, shift, shown, opaque, 100) == 0.0f;
 }
 
-// What lies behind the frame's surface is hidden, unless it is nearly transparent or references look through that surface, as
-// those do that have it in their image: one of many, two of few photos, which are trusted by half then.
+// What lies in front of the frame's surface counts a tenth, unless that is nearly transparent. What lies behind it is hidden,
+// unless it is nearly transparent or references look through it, as those do that have it in their image: one of many, two of
+// few photos, which are trusted by half then.
 static void test_warp_hidden(void) {
     CHECK(warp_keeps(6, 2, 0.4, 0.5f, 1) && warp_keeps(8, 2, -0.4, 0.5f, 1));
     CHECK(warp_keeps(5, 2, 0.4, 0.5f, 1) && warp_keeps(2, 2, 0.4, 0.5f, 1) && !warp_keeps(6, 2, 0.4, 0.95f, 1));
@@ -229,13 +230,17 @@ static void test_warp_hidden(void) {
     CHECK(!warp_keeps(5, 2, 0.1, 0.5f, 1) && warp_keeps(5, 1, 0.0, 0.5f, 1) && !warp_keeps(6, 1, 0.0, 0.5f, 1));
     for (int count = 5; count <= 6; count++) {
         CHECK(!warp_keeps(count, 2, 0.4, 0.5f, 0) && !warp_keeps(count, 2, 0.4, 0.0f, 1)); // transparent, or nothing there
-        CHECK(!warp_keeps(count, 2, 0.4, 2.0f, 1) && !warp_keeps(count, 2, 0.4, 0.97f, 1)); // in front, or hardly behind
-        const float verified = warp_confidence(count, 2, 0.0, 2.0f, 1, 100);
+        CHECK(!warp_keeps(count, 2, 0.4, 1.03f, 1) && !warp_keeps(count, 2, 0.4, 0.97f, 1)); // hardly in front or behind
+        CHECK(!warp_keeps(count, 2, 0.4, 2.0f, 1) && !warp_keeps(count, 2, 0.4, 2.0f, 0)); // in front
+        const float verified = warp_confidence(count, 2, 0.0, 1.0f, 1, 100);
+        CHECK_NEAR(warp_confidence(count, 2, 0.0, 1.05f, 1, 100), 0.1f * verified, 1e-6);
+        CHECK_NEAR(warp_confidence(count, 2, 0.0, 1.05f, 0, 100), verified, 1e-6);
+        CHECK_NEAR(warp_confidence(count, 2, 0.0, 1.03f, 1, 100), verified, 1e-6);
         const float floater = warp_confidence(count, 2, 0.0, 0.5f, 1, 100);
         CHECK_NEAR(floater, (count < 6 ? 0.5f : 1.0f) * verified, 1e-6);
         CHECK(verified > 0.0f);
         // what nothing verifies is hidden, too, and replaces no floater of few photos
-        const float usual = warp_confidence(count, 2, 0.0, 2.0f, 1, 30);
+        const float usual = warp_confidence(count, 2, 0.0, 2.0f, 0, 30);
         const float looked_through = warp_confidence(count, 2, 0.0, 0.6f, 1, 30);
         if (count < 6) CHECK_NEAR(looked_through, 0.5f * usual, 1e-6);
         else CHECK(looked_through > usual);
