@@ -702,7 +702,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fix
                                                        const void* chunks, size_t size);
 
 // ---- from photos to splats -----------------------------------------------------
-/* The choices of the program `gsfix fix`, based on measurements (bench/QUALITY.md) with scenes of 3 to 50 photos. A host
+/* The choices of the program `gsfix fix`, based on measurements (bench/TRIED.md) with scenes of 3 to 50 photos. A host
    that makes the same calls gets bit-identical splats; every value may be changed in between.
        gsf_splat_load_scene              cameras and points
        gsf_splat_load_train_views        photos
@@ -13892,11 +13892,11 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     if (out->struct_size >= sizeof *out) {
         out->needs_carried = GSF__WARP_NEAREST;
         // Weight 1 gains no more, but leaves some scenes below those without repair. More photos show more, so that repair
-        // adds less to them. Measured in bench/QUALITY.md
+        // adds less to them. Measured in bench/TRIED.md
         out->lambda = 0.5f;
         out->lambda_views = 6;
         // Whole frames cost more and gain the same, as the photos show all detail; halved ones of small photos are too coarse.
-        // Measured in bench/QUALITY.md
+        // Measured in bench/TRIED.md
         if (width >= GSF__WARP_HALVED && height >= GSF__WARP_HALVED) out->frame_scale = 0.5f;
     }
     const int32_t count = warp->own.count > 0 ? warp->own.count : 3;
