@@ -618,8 +618,9 @@ typedef struct gsf_nn_mini_desc {
 } gsf_nn_mini_desc;
 
 /* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
-   the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains.
-   It takes frames of any size and any number. Weights are f32, bf16, f16, or 8-bit integers with a factor per output:
+   the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains,
+   from which the confidence is made; that is 0 where no photo shows anything. It takes frames of any size and any number.
+   Weights are f32, bf16, f16, or 8-bit integers with a factor per output:
    NAME.weight as I8 with NAME.weight_scale, the layout of compressed-tensors. A host embeds it in three lines:
        gsf_nn_mini_desc desc = {0};
        desc.data = bytes, desc.size = byte_count;    // or desc.path
@@ -15719,9 +15720,9 @@ static void gsf__mini_relu(gsf__mini_run* r, float* x, int64_t count) {
     gsf__nn_activate(r->ctx, GSF__NN_RELU, x, count, x);
 }
 
-// Whether the reference shows anything in a coarse pixel.
-static int gsf__mini_shows(const float* shown) {
-    for (int part = 0; part < 4; part++, shown += GSF__MINI_REFERENCE)
+// Whether any of `count` pixels of references, `pitch` floats apart, shows anything.
+static int gsf__mini_shows(const float* shown, int64_t count, int64_t pitch) {
+    for (int64_t i = 0; i < count; i++, shown += pitch)
         if (shown[6] > 0.0f || shown[12] > 0.0f) return 1;
     return 0;
 }
@@ -15742,7 +15743,8 @@ static void gsf__mini_join_row(void* arg, size_t index, int32_t worker) {
         float top = 0.0f, sum;
         uint32_t showing = 0; // a bit for each reference
         for (int64_t k = 0; k < n; k++) {
-            if (gsf__mini_shows(r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE)) showing |= 1u << k;
+            const float* parts = r->shown + (first + k * plane) * 4 * GSF__MINI_REFERENCE;
+            if (gsf__mini_shows(parts, 4, GSF__MINI_REFERENCE)) showing |= 1u << k;
             else memset(f + k * plane * e, 0, (size_t)e * sizeof(float));
         }
         GSF__WIDE_KERNEL_OF(r->ctx->cpu_level, gsf__map_products)(attention, f, n, plane * e, e, 1.0f, share);
@@ -16057,16 +16059,20 @@ static gsf_result gsf__mini_fit(gsf_context* ctx, gsf__mini_restorer* r, int64_t
     return GSF_OK;
 }
 
-// Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b.
-static void gsf__mini_write(const gsf__mini_restorer* r, const gsf_image* color, const gsf_image* confidence) {
+// Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b; 0
+// where no reference shows anything, since splats that train on a guess make the render of the next guess.
+static void gsf__mini_write(const gsf__mini_restorer* r, const float* shown, const gsf_image* color,
+                            const gsf_image* confidence) {
     const float square = r->desc.sigma * r->desc.sigma;
+    const int64_t plane = color->width * color->height * GSF__MINI_REFERENCE;
     for (int64_t y = 0; y < color->height; y++) {
         const float *out = r->run.out + 3 * y * r->run.width, *error = r->run.error + y * r->run.width;
         char *to = (char*)color->data + y * color->stride_y, *weight = (char*)confidence->data + y * confidence->stride_y;
-        for (int64_t x = 0; x < color->width; x++) {
+        for (int64_t x = 0; x < color->width; x++, shown += GSF__MINI_REFERENCE) {
+            const int known = gsf__mini_shows(shown, r->desc.references, plane);
             for (int64_t c = 0; c < 3; c++)
                 *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) = gsf__mini_clamp(out[3 * x + c], 0.0f, 1.0f);
-            *(float*)(void*)(weight + x * confidence->stride_x) = square / (square + expf(2.0f * error[x]));
+            *(float*)(void*)(weight + x * confidence->stride_x) = known ? square / (square + expf(2.0f * error[x])) : 0.0f;
         }
     }
 }
@@ -16101,7 +16107,7 @@ static gsf_result gsf__mini_restore_frame(gsf_context* ctx, gsf__mini_restorer* 
     GSF__TRY(gsf__mini_forward(&r->run, &input));
     GSF__TRY(gsf__nn_check_finite(ctx, &r->net.weights, "mini", "", "the network", r->run.out,
                                   3 * r->run.width * r->run.height));
-    gsf__mini_write(r, window->out_color + frame, window->out_confidence + frame);
+    gsf__mini_write(r, shown, window->out_color + frame, window->out_confidence + frame);
     return GSF_OK;
 }
 

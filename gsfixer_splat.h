@@ -14070,7 +14070,7 @@ static float gsf__warp_pixel(const gsf__warp_job* job, const gsf_camera* camera,
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
         rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / (verified ? total : fmaxf(total, GSF__WARP_TRUST));
-    const int in_front = opaque && front < shown * (1.0f - GSF__CARRY_DEPTH_TOLERANCE);
+    const int in_front = opaque && !agrees && front < shown;
     const float trust = in_front ? GSF__WARP_IN_FRONT : few && hidden ? GSF__WARP_FLOATER : 1.0f;
     return trust * (verified || refuted || total > 1.0f ? 1.0f : total) * agreement;
 }

@@ -484,7 +484,9 @@ static void run_restorer(gsf_context* ctx, const gsf_restorer* mini, clip* c, gs
 }
 
 static void test_restorer(gsf_context* ctx) {
-    static clip c, from_memory;
+    const double weight = 0.05 * 0.05 / (0.05 * 0.05 + exp(-6.0)); // for an expected error of e^-3
+    static clip c, from_memory, hidden;
+    float *score = hidden.carried + 9 * PIXELS, *back_ratio = hidden.carried + 12 * PIXELS;
     gsf_nn_mini_desc desc;
     gsf_restorer mini;
     gsf__mini net, sizes = tiny();
@@ -492,7 +494,7 @@ static void test_restorer(gsf_context* ctx) {
     size_t size;
     float* values = (float*)(void*)&c;
     for (size_t i = 0; i < sizeof c / sizeof *values; i++) values[i] = (float)test_random_in(&mini_seed, 0.1, 1.0);
-    from_memory = c;
+    from_memory = hidden = c;
     memset(&desc, 0, sizeof desc);
     CHECK_RESULT(ctx, gsf_nn_make_mini(ctx, &desc, &mini), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_OK(ctx, gsf__mini_make(ctx, &sizes, 5, made_path()));
@@ -500,7 +502,10 @@ static void test_restorer(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_nn_make_mini(ctx, &desc, &mini));
     run_restorer(ctx, &mini, &c, GSF_OK, 1);
     for (int i = 0; i < 3 * PIXELS; i++) CHECK(c.out[i] >= 0.0f && c.out[i] <= 1.0f && fabsf(c.out[i] - c.color[i]) < 0.025f);
-    for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)c.weight[i], 0.05 * 0.05 / (0.05 * 0.05 + exp(-6.0)), 1e-6); // b = e^-3
+    for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)c.weight[i], weight, 1e-6);
+    score[0] = score[2] = back_ratio[1] = back_ratio[2] = 0.0f;
+    run_restorer(ctx, &mini, &hidden, GSF_OK, 1);
+    for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)hidden.weight[i], i == 2 ? 0.0 : weight, 1e-6); // nothing shows pixel 2
     run_restorer(ctx, &mini, &c, GSF_ERROR_UNSUPPORTED, 0);
     gsf_destroy_restorer(ctx, &mini);
     CHECK_OK(ctx, gsf_read_file(ctx, made_path(), &bytes, &size));
