@@ -134,6 +134,8 @@ def main():
         name, program, extra = split_arm(text)
         arms[name] = (program or options.gsfix, extra)
     options.base = options.base or next(iter(arms))
+    if options.base not in arms:
+        parser.error("--base: no arm " + options.base)
     os.makedirs(options.out, exist_ok=True)
     if not options.tables:
         jobs = [((scene, views, arm, seed), program, extra) for views in options.views for seed in range(1, options.seeds + 1)
