@@ -16002,7 +16002,7 @@ static gsf_result gsf__mini_query(void* user, gsf_context* ctx, int32_t frame_co
     out->needs_depth = out->needs_alpha = 1;
     if (out->struct_size < sizeof *out) return GSF_OK;
     out->needs_carried = r->desc.references;
-    out->lambda = 2.0f; // its frames are worth more than the photos' weight: measured in bench/QUALITY.md
+    out->lambda = 2.0f; // its frames are worth more than the photos' weight: measured in bench/TRIED.md
     out->lambda_views = 3;
     memset(&run, 0, sizeof run);
     run.net = &r->net;

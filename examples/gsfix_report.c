@@ -211,7 +211,7 @@ static gsf_result put_samples(page* p) {
     gsfix_put(p, "<section><h2>Repaired frames</h2><p>Between training steps, frames along a camera path are rendered and repaired, and "
            "training continues on the photos and the repaired frames: %d frames in %zu rounds", restored, h->round_count);
     if (skipped) gsfix_put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
-    gsfix_put_raw(p, ". Confidence is the weight of each pixel in training; black pixels, where the repair may show seams, are "
+    gsfix_put_raw(p, ". Confidence is the weight of each pixel in training; black pixels, seams and mere guesses, are "
                "ignored.</p>\n<div class=\"cards broad\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_sample(p, &h->samples[0]);
