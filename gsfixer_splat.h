@@ -7659,10 +7659,9 @@ enum {
     GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 4 columns and 2 rows: splats are compact, so that this shape needs
                                          // fewer steps than 8 pixels of a row
     GSF__TOGETHER = 32,                  // list entries that are found together and blended step by step
-    GSF__AHEAD = 8,                      // the same by backward, which blends them one after the other
     GSF__PROJECT_CHUNK = 256,            // splats
     GSF__BUCKET = 4096,                  // steps that backward keeps at a time, plus the rest of the last entries
-    GSF__KEPT_MOST = GSF__BUCKET + GSF__AHEAD * GSF__STEPS + 1,
+    GSF__KEPT_MOST = GSF__BUCKET + GSF__TOGETHER * GSF__STEPS,
 };
 
 // Slot layout. Sums over pixels, where p = dL/d(ln alpha), w = alpha*T, (e, dy) is the pixel's position in the record's
@@ -9228,109 +9227,92 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
 
 #if GSF__X86
 
-// The steps of up to GSF__AHEAD list entries and their alphas, found before any of them is blended. An alpha takes long to
-// compute, but nothing that it waits for; a blend waits for the one before it in the same pixels.
-typedef struct gsf__batch {
-    GSF__LINES float raw[GSF__AHEAD * GSF__TILE_PIXELS]; // of each item: alpha before the clamp, 0 where below 1/255
-    uint32_t items[GSF__AHEAD * GSF__STEPS + 16];     // entry << 8 | step, in the order of the list
-    gsf__entries entries;
-} gsf__batch;
-
-// Lists the steps of the entries from `first` to `end` that are in `live`; returns their number.
-GSF__INLINE_AVX2 size_t gsf__batch_avx2(const gsf__tile* tile, size_t first, size_t end, uint32_t live, gsf__batch* batch) {
-    size_t count = 0;
-    gsf__find_avx2(tile, first, end, &batch->entries);
-    for (size_t at = 0; at < end - first; at++)
-        for (uint32_t m = batch->entries.overlaps[at] & live; m; m &= m - 1, count++) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
-            batch->items[count] = (uint32_t)at << 8 | s;
-            _mm256_storeu_ps(batch->raw + 8 * count, gsf__alpha_avx2(&batch->entries, at, columns, 2 * (s & 7)));
-        }
-    return count;
+// Reserves places, in the order of the list, for the steps of found entries that are in `live`; returns the one behind them.
+GSF__INLINE_AVX2 size_t gsf__reserve_steps(const gsf__entries* entries, uint32_t live, size_t kept,
+                                           size_t place[GSF__TOGETHER]) {
+    for (size_t at = 0; at < GSF__TOGETHER; at++) {
+        place[at] = kept;
+        kept += (size_t)__builtin_popcount(entries->overlaps[at] & live);
+    }
+    return kept;
 }
 
-// Blends alphas (after the clamp) into T. Finished pixels keep theirs, which is negative. Returns where the splat is
-// blended. Without branches, because it is hard to predict when a pixel finishes.
-GSF__INLINE_AVX2 __m256 gsf__next_avx2(__m256 alpha, float* memory) {
-    const __m256 T = _mm256_loadu_ps(memory), open = _mm256_max_ps(T, _mm256_setzero_ps());
-    const __m256 next = _mm256_fnmadd_ps(open, alpha, T), shown = _mm256_cmp_ps(next, _mm256_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    _mm256_storeu_ps(memory, _mm256_blendv_ps(_mm256_or_ps(T, _mm256_set1_ps(-0.0f)), next, shown));
-    return shown;
-}
-
-GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps,
+// Goes through the tile as gsf__blend_avx2_body does, step by step, but writes in the order of the list, as reverse reads.
+GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last, gsf__step* steps,
                                               gsf__step_head* heads, size_t* step_count) {
-    gsf__batch batch;
-    uint32_t live = gsf__live_avx2(T);
-    size_t kept = 0, i = first;
-    for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end, live = gsf__live_avx2(T)) {
-        end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
-        const size_t count = gsf__batch_avx2(tile, i, end, live, &batch);
-        for (size_t k = 0; k < count; k++) {
-            const uint32_t s = batch.items[k] & 255u;
-            const __m256 raw = _mm256_loadu_ps(batch.raw + 8 * k);
-            _mm256_storeu_ps(steps[kept].T, _mm256_loadu_ps(T + 8 * s));
-            const __m256 shown = gsf__next_avx2(_mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T + 8 * s);
-            const __m256 alpha = _mm256_and_ps(shown, raw);
-            _mm256_storeu_ps(steps[kept].alpha, alpha);
-            heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
-            heads[kept].step = s;
-            kept += !_mm256_testz_si256(_mm256_castps_si256(alpha), _mm256_castps_si256(alpha));
+    gsf__entries entries;
+    size_t place[GSF__TOGETHER], kept = 0, i = first;
+    const __m256 least = _mm256_set1_ps(GSF__T_MIN);
+    uint32_t live = gsf__live_avx2(T_tile);
+    for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end) {
+        end = i + GSF__TOGETHER < last ? i + GSF__TOGETHER : last;
+        gsf__find_avx2(tile, i, end, &entries);
+        kept = gsf__reserve_steps(&entries, live, kept, place);
+        for (uint32_t m = live; m; m &= m - 1) {
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
+            uint32_t left = gsf__entries_of_avx2(&entries, s);
+            if (!left) continue;
+            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
+            __m256 final = _mm256_loadu_ps(T_tile + 8 * s), T = _mm256_max_ps(final, _mm256_setzero_ps()), shown;
+            do {
+                const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
+                const __m256 raw = gsf__alpha_avx2(&entries, at, columns, 2 * (s & 7));
+                const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T);
+                shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
+                _mm256_storeu_ps(steps[k].alpha, _mm256_and_ps(shown, raw));
+                _mm256_storeu_ps(steps[k].T, T);
+                heads[k].entry = (uint32_t)(i + at);
+                heads[k].step = s;
+                final = _mm256_blendv_ps(final, next, shown);
+                T = next;
+                left &= left - 1;
+            } while (left);
+            if (!_mm256_movemask_ps(shown)) live &= ~(1u << s);
+            const __m256 finished = _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f));
+            _mm256_storeu_ps(T_tile + 8 * s, _mm256_or_ps(final, finished));
         }
     }
     *step_count = kept;
     return live && i < last ? i : tile->count;
 }
 
-// Like gsf__batch_avx2, for blocks; bits of `live` are those of gsf__rows_avx512.
-GSF__INLINE_AVX512 size_t gsf__batch_avx512(const gsf__tile* tile, size_t first, size_t end, uint32_t live,
-                                            gsf__batch* batch) {
-    const __m512i blocks = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-    size_t count = 0;
-    gsf__find_avx512(tile, first, end, &batch->entries);
-    for (size_t at = 0; at < end - first; at++) {
-        const uint32_t mask = batch->entries.overlaps[at] & live;
-        const __m512i items = _mm512_or_si512(blocks, _mm512_set1_epi32((int)at << 8));
-        _mm512_storeu_si512(batch->items + count, _mm512_maskz_compress_epi32((__mmask16)mask, items));
-        count += (size_t)__builtin_popcount(mask);
-    }
-    for (size_t k = 0; k < count; k++) {
-        const size_t block = batch->items[k] & 255u;
-        const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
-        _mm512_storeu_ps(batch->raw + 16 * k,
-                        gsf__alpha_avx512(&batch->entries, batch->items[k] >> 8, columns, 4 * (block & 3)));
-    }
-    return count;
-}
-
-// As gsf__next_avx2.
-GSF__INLINE_AVX512 __mmask16 gsf__next_avx512(__m512 alpha, float* memory) {
-    const __m512 T = _mm512_loadu_ps(memory), open = _mm512_max_ps(T, _mm512_setzero_ps());
-    const __m512 next = _mm512_fnmadd_ps(open, alpha, T);
-    const __mmask16 shown = _mm512_cmp_ps_mask(next, _mm512_set1_ps(GSF__T_MIN), _CMP_GE_OQ);
-    _mm512_storeu_ps(memory, _mm512_mask_mov_ps(_mm512_or_ps(T, _mm512_set1_ps(-0.0f)), shown, next));
-    return shown;
-}
-
-GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T, size_t first, size_t last,
+// As gsf__keep_avx2, with a block in place of a step.
+GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
                                                   gsf__step* memory, gsf__step_head* heads, size_t* step_count) {
     gsf__wide_step* steps = (gsf__wide_step*)(void*)memory;
-    gsf__batch batch;
-    uint32_t live = gsf__live_avx512(T);
-    size_t kept = 0, i = first;
-    for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end, live = gsf__live_avx512(T)) {
-        end = i + GSF__AHEAD < last ? i + GSF__AHEAD : last;
-        const size_t count = gsf__batch_avx512(tile, i, end, live, &batch);
-        for (size_t k = 0; k < count; k++) {
-            const uint32_t block = batch.items[k] & 255u;
-            const __m512 raw = _mm512_loadu_ps(batch.raw + 16 * k);
-            _mm512_storeu_ps(steps[kept].T, _mm512_loadu_ps(T + 16 * block));
-            const __mmask16 shown = gsf__next_avx512(_mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T + 16 * block);
-            _mm512_storeu_ps(steps[kept].alpha, _mm512_maskz_mov_ps(shown, raw));
-            heads[kept].entry = (uint32_t)i + (batch.items[k] >> 8);
-            heads[kept].step = block;
-            kept += _mm512_mask_cmp_ps_mask(shown, raw, _mm512_setzero_ps(), _CMP_GT_OQ) != 0;
+    gsf__entries entries;
+    size_t place[GSF__TOGETHER], kept = 0, i = first;
+    const __m512 least = _mm512_set1_ps(GSF__T_MIN);
+    uint32_t live = gsf__live_avx512(T_tile);
+    for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end) {
+        end = i + GSF__TOGETHER < last ? i + GSF__TOGETHER : last;
+        gsf__find_avx512(tile, i, end, &entries);
+        kept = gsf__reserve_steps(&entries, live, kept, place);
+        const __m512i overlaps = _mm512_loadu_si512(entries.overlaps), more = _mm512_loadu_si512(entries.overlaps + 16);
+        for (uint32_t m = live; m; m &= m - 1) {
+            const uint32_t number = (uint32_t)gsf__lowest_bit(m), block = (number & 3) << 2 | number >> 2;
+            const __m512i bit = _mm512_set1_epi32((int)(1u << number));
+            uint32_t left = (uint32_t)_mm512_test_epi32_mask(overlaps, bit) |
+                            (uint32_t)_mm512_test_epi32_mask(more, bit) << 16;
+            if (!left) continue;
+            const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
+            __m512 final = _mm512_loadu_ps(T_tile + 16 * block), T = _mm512_max_ps(final, _mm512_setzero_ps());
+            __mmask16 shown;
+            do {
+                const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
+                const __m512 raw = gsf__alpha_avx512(&entries, at, columns, 4 * (block & 3));
+                const __m512 next = _mm512_fnmadd_ps(T, _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T);
+                shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
+                _mm512_storeu_ps(steps[k].alpha, _mm512_maskz_mov_ps(shown, raw));
+                _mm512_storeu_ps(steps[k].T, T);
+                heads[k].entry = (uint32_t)(i + at);
+                heads[k].step = block;
+                final = _mm512_mask_mov_ps(final, shown, next);
+                T = next;
+                left &= left - 1;
+            } while (left);
+            if (!shown) live &= ~(1u << number);
+            _mm512_storeu_ps(T_tile + 16 * block, _mm512_mask_or_ps(final, (__mmask16)~shown, final, _mm512_set1_ps(-0.0f)));
         }
     }
     *step_count = kept;
@@ -9381,8 +9363,8 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
                 sz = _mm256_fmadd_ps(w, gz, sz);
             }
             _mm256_storeu_ps(gradient->behind + at, _mm256_fmadd_ps(alpha, F, behind));
-            __m256 p = _mm256_mul_ps(_mm256_mul_ps(T, raw), F);
-            if (!straight_through) p = _mm256_and_ps(p, _mm256_cmp_ps(raw, alpha_max, _CMP_LE_OQ));
+            const __m256 p = straight_through ? _mm256_mul_ps(_mm256_mul_ps(T, raw), F)
+                                              : _mm256_and_ps(_mm256_mul_ps(w, F), _mm256_cmp_ps(raw, alpha_max, _CMP_LE_OQ));
             const __m256 pe = _mm256_mul_ps(p, e), py = _mm256_mul_ps(p, dy);
             sp = _mm256_add_ps(sp, p);
             se = _mm256_add_ps(se, pe);
@@ -9468,8 +9450,8 @@ GSF__INLINE_AVX512 void gsf__reverse_avx512_body(const gsf__tile* tile, const gs
                 sz = _mm512_fmadd_ps(w, gz, sz);
             }
             _mm512_storeu_ps(gradient->behind + at, _mm512_fmadd_ps(alpha, F, behind));
-            __m512 p = _mm512_mul_ps(_mm512_mul_ps(T, raw), F);
-            if (!straight_through) p = _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(raw, alpha_max, _CMP_LE_OQ), p);
+            const __m512 p = straight_through ? _mm512_mul_ps(_mm512_mul_ps(T, raw), F)
+                                              : _mm512_maskz_mul_ps(_mm512_cmp_ps_mask(raw, alpha_max, _CMP_LE_OQ), w, F);
             const __m512 pe = _mm512_mul_ps(p, e), py = _mm512_mul_ps(p, dy);
             sp = _mm512_add_ps(sp, p);
             se = _mm512_add_ps(se, pe);
