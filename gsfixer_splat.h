@@ -7670,7 +7670,8 @@ enum {
     GSF__SLOT_P, GSF__SLOT_E, GSF__SLOT_EE, GSF__SLOT_Y, GSF__SLOT_EY, GSF__SLOT_YY, // sums of p times 1 e ee dy e*dy dy*dy
     GSF__SLOT_R, GSF__SLOT_G, GSF__SLOT_B, GSF__SLOT_Z,                              // sums of w times dL/dcolor, dL/dD
     GSF__SLOT_ABS_X, GSF__SLOT_ABS_Y,                                                // sums of |dL/du|, |dL/dv|
-    GSF__SLOT_FLOATS,
+    GSF__SLOT_SUMS,
+    GSF__SLOT_FLOATS = 16, // a cache line
 };
 
 #define GSF__ALPHA_MAX 0.99f
@@ -9402,7 +9403,7 @@ GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf_
         gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
 }
 
-// Horizontal sums of twelve vectors, in the first twelve lanes of the result.
+// Horizontal sums of twelve vectors, in the first twelve lanes of the result; the others are finite if all are.
 GSF__INLINE_AVX512 __m512 gsf__sum12_avx512(const __m512 v[12]) {
     __m512 pair[6], four[3];
     for (int i = 0; i < 6; i++) // halves of 2 i, then of 2 i + 1
@@ -9470,7 +9471,7 @@ GSF__INLINE_AVX512 void gsf__reverse_avx512_body(const gsf__tile* tile, const gs
         }
         const __m512 parts[12] = {sp, se, see, sy, sey, syy, sr, sg, sb, sz, _mm512_mul_ps(sax, _mm512_set1_ps(conic_a)), say};
         // complete: an entry's steps are all in one bucket
-        _mm512_mask_storeu_ps(slots + GSF__SLOT_FLOATS * entry, 0x0fff, gsf__sum12_avx512(parts));
+        _mm512_storeu_ps(slots + GSF__SLOT_FLOATS * entry, gsf__sum12_avx512(parts));
         slot_used[entry] = 1;
     }
 }
@@ -9536,8 +9537,8 @@ GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const 
         const gsf__vf_simd128 u = gsf__v_set_simd128(rec->u - tile->x0 + rec->u_low);
         const gsf__vf_simd128 v = gsf__v_set_simd128(rec->v - tile->y0 + rec->v_low), kx = gsf__v_set_simd128(rec->kx);
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
-        gsf__vf_simd128 sum[GSF__SLOT_FLOATS];
-        for (int i = 0; i < GSF__SLOT_FLOATS; i++) sum[i] = zero;
+        gsf__vf_simd128 sum[GSF__SLOT_SUMS];
+        for (int i = 0; i < GSF__SLOT_SUMS; i++) sum[i] = zero;
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
             const gsf__step* step = steps + k - 1;
             const size_t s = heads[k - 1].step;
@@ -9581,7 +9582,7 @@ GSF__INLINE_SIMD128 void gsf__reverse_body_simd128(const gsf__tile* tile, const 
             }
         }
         sum[GSF__SLOT_ABS_X] = sum[GSF__SLOT_ABS_X] * gsf__v_set_simd128(conic_a);
-        for (int i = 0; i < GSF__SLOT_FLOATS; i += 4) { // complete: an entry's steps are all in one bucket
+        for (int i = 0; i < GSF__SLOT_SUMS; i += 4) { // complete: an entry's steps are all in one bucket
             gsf__v_transpose_simd128(sum + i);
             gsf__v_store_simd128(slots + GSF__SLOT_FLOATS * entry + i, (sum[i] + sum[i + 2]) + (sum[i + 1] + sum[i + 3]));
         }
@@ -9612,7 +9613,7 @@ static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
 // ---- >>project backward --------------------------------------------------------
 
 #endif // GSF__ISA
-#if defined(GSF__KERNELS_SPLATS) && GSF__LANES <= 8
+#ifdef GSF__KERNELS_SPLATS
 
 // Derivative of sum(weight * basis) with respect to the direction, without that of the normalisation. count >= 4.
 GSF__V_INLINE void GSF__V(gsf__sh_direction_gradient)(const gsf__vf d[3], int32_t count, const gsf__vf weight[16],
@@ -9649,11 +9650,10 @@ GSF__V_INLINE void GSF__V(gsf__add_column)(float* rows, size_t stride, gsf__vf v
     for (size_t l = 0; l < count; l++) rows[stride * l] += lanes[l];
 }
 
-// Sums the slots of each splat from i on, in double and in tile order, into the first GSF__SLOT_FLOATS columns. Returns
+// Sums the slots of each splat from i on, in double and in tile order, into the first GSF__SLOT_SUMS columns. Returns
 // a bit for every splat that has a slot in use.
 GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i, size_t count, gsf__vf columns[16]) {
-    const size_t row = GSF__SLOT_FLOATS;
-    enum { WIDE = GSF__LANES / GSF__HALVES };
+    enum { WIDE = GSF__LANES / GSF__HALVES, PARTS = (GSF__SLOT_SUMS + WIDE - 1) / WIDE };
     uint32_t touched = 0;
     for (size_t l = 0; l < GSF__LANES; l++) {
         gsf__vd sums[16 / WIDE];
@@ -9663,24 +9663,38 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
                 const size_t entry = r->splat_entries[s];
                 if (!r->slot_used[entry]) continue;
                 const float* slot = r->slots + GSF__SLOT_FLOATS * entry;
-                for (size_t k = 0; k < row / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
+                for (size_t k = 0; k < PARTS; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
                 touched |= 1u << l;
             }
         }
-        for (size_t k = 0; k < GSF__SLOT_FLOATS; k += GSF__LANES) columns[k + l] = gsf__vd_floats(sums + k / WIDE);
+        for (size_t k = 0; k < GSF__SLOT_SUMS; k += GSF__LANES) columns[k + l] = gsf__vd_floats(sums + k / WIDE);
     }
-    for (size_t k = 0; k < GSF__SLOT_FLOATS; k += GSF__LANES) gsf__v_transpose(columns + k);
+    for (size_t k = 0; k < GSF__SLOT_SUMS; k += GSF__LANES) gsf__v_transpose(columns + k);
     return touched;
 }
 
-// Prefetches data of the splats from i on: their slots are scattered over memory, and rows of SH are long.
+// Prefetches rows of `width` floats of the splats from i on.
+GSF__V_INLINE void GSF__V(gsf__fetch_rows)(const float* rows, size_t width, size_t i) {
+    for (size_t at = width * i; at < width * (i + GSF__LANES) && rows; at += 16) gsf__v_fetch(rows + at);
+}
+
+// Prefetches data of the splats from i on: their slots are scattered over memory, and all else is more streams than the
+// processor follows.
 GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                              const gsf_splat_grads* grads, size_t i) {
     for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + GSF__LANES]; s++) {
         const float* slot = r->slots + GSF__SLOT_FLOATS * r->splat_entries[s];
         gsf__v_fetch(slot);
-        gsf__v_fetch(slot + GSF__SLOT_FLOATS - 1);
     }
+    for (size_t l = 0; l < GSF__LANES; l++) gsf__v_fetch(&r->records[i + l].u);
+    GSF__V(gsf__fetch_rows)(splats->means, 3, i);
+    GSF__V(gsf__fetch_rows)(splats->log_scales, 3, i);
+    GSF__V(gsf__fetch_rows)(splats->quats, 4, i);
+    GSF__V(gsf__fetch_rows)(splats->opacity_logits, 1, i);
+    GSF__V(gsf__fetch_rows)(grads->means, 3, i);
+    GSF__V(gsf__fetch_rows)(grads->log_scales, 3, i);
+    GSF__V(gsf__fetch_rows)(grads->quats, 4, i);
+    GSF__V(gsf__fetch_rows)(grads->opacity_logits, 1, i);
     const size_t row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree), used = 3 * (size_t)view->sh_coefficients;
     for (size_t at = row * i, end = at + GSF__LANES * row; at < end; at += row)
         for (size_t k = 0; k < used; k += 16) {
@@ -9855,8 +9869,8 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
     const size_t end = gsf__splat_chunk_end(job->r, chunk);
-    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__LANE_KERNEL_OF(job->level, GSF__LANES))
-        GSF__LANE_KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__ANY_KERNEL_OF(job->level, GSF__LANES))
+        GSF__ANY_KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
 }
 
 // ---- >>render ------------------------------------------------------------------
