@@ -8820,47 +8820,53 @@ GSF__INLINE_AVX2 uint32_t gsf__entries_of_avx2(const gsf__entries* entries, uint
     return found;
 }
 
-// Entries are found together; then each step blends those that overlap it while its pixels are in registers. T goes on
-// falling where a pixel is finished, so that no blend waits for the comparison of the one before.
+// Blends the entries `left` into step s while its pixels are in registers. Few steps have a pixel that is finished or
+// becomes so; they need `closing`. Without it, such a step is left as it is and the result is 0. With it, the result is
+// whether a pixel is still open, and T goes on falling where one is finished, so that no blend waits for a comparison.
+GSF__INLINE_AVX2 int gsf__blend_step_avx2(const gsf__entries* entries, uint32_t left, uint32_t s, gsf__tile_state* state,
+                                          int with_depth, int closing) {
+    float *r = state->r + 8 * s, *g = state->g + 8 * s, *b = state->b + 8 * s, *z = state->z + 8 * s;
+    const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3)), least = _mm256_set1_ps(GSF__T_MIN);
+    __m256 last = _mm256_loadu_ps(state->T + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps()), shown = last;
+    __m256 red = _mm256_loadu_ps(r), green = _mm256_loadu_ps(g), blue = _mm256_loadu_ps(b), depth = _mm256_loadu_ps(z);
+    for (; left; left &= left - 1) {
+        const size_t at = (size_t)gsf__lowest_bit(left);
+        const gsf__record* rec = entries->rec[at];
+        const __m256 raw = gsf__alpha_avx2(entries, at, columns, 2 * (s & 7));
+        const __m256 alpha = _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), next = _mm256_fnmadd_ps(T, alpha, T);
+        __m256 w = _mm256_mul_ps(T, alpha);
+        if (closing) {
+            shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
+            w = _mm256_and_ps(shown, w);
+            last = _mm256_blendv_ps(last, next, shown);
+        }
+        red = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->r), red);
+        green = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->g), green);
+        blue = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->b), blue);
+        if (with_depth) depth = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth), depth);
+        T = next;
+    }
+    if (closing) T = _mm256_or_ps(last, _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f)));
+    else if (_mm256_movemask_ps(_mm256_cmp_ps(T, least, _CMP_GE_OQ)) != 255) return 0;
+    _mm256_storeu_ps(state->T + 8 * s, T);
+    _mm256_storeu_ps(r, red);
+    _mm256_storeu_ps(g, green);
+    _mm256_storeu_ps(b, blue);
+    if (with_depth) _mm256_storeu_ps(z, depth);
+    return !closing || _mm256_movemask_ps(shown) != 0;
+}
+
+// Entries are found together; then each step blends those that overlap it.
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
     gsf__entries entries;
-    const __m256 least = _mm256_set1_ps(GSF__T_MIN);
     uint32_t live = gsf__live_avx2(state->T);
     for (size_t i = 0, end; i < tile->count && live; i = end) {
         end = i + GSF__TOGETHER < tile->count ? i + GSF__TOGETHER : tile->count;
         gsf__find_avx2(tile, i, end, &entries);
         for (uint32_t m = live; m; m &= m - 1) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            uint32_t left = gsf__entries_of_avx2(&entries, s);
-            if (!left) continue;
-            float *r = state->r + 8 * s, *g = state->g + 8 * s, *b = state->b + 8 * s, *z = state->z + 8 * s;
-            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
-            __m256 last = _mm256_loadu_ps(state->T + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps());
-            __m256 red = _mm256_loadu_ps(r), green = _mm256_loadu_ps(g), blue = _mm256_loadu_ps(b), depth = _mm256_loadu_ps(z);
-            __m256 shown;
-            do {
-                const size_t at = (size_t)gsf__lowest_bit(left);
-                const gsf__record* rec = entries.rec[at];
-                const __m256 raw = gsf__alpha_avx2(&entries, at, columns, 2 * (s & 7));
-                const __m256 alpha = _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX));
-                const __m256 next = _mm256_fnmadd_ps(T, alpha, T);
-                shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
-                const __m256 w = _mm256_and_ps(shown, _mm256_mul_ps(T, alpha));
-                last = _mm256_blendv_ps(last, next, shown);
-                red = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->r), red);
-                green = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->g), green);
-                blue = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->b), blue);
-                if (with_depth) depth = _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth), depth);
-                T = next;
-                left &= left - 1;
-            } while (left);
-            if (!_mm256_movemask_ps(shown)) live &= ~(1u << s);
-            const __m256 finished = _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f));
-            _mm256_storeu_ps(state->T + 8 * s, _mm256_or_ps(last, finished));
-            _mm256_storeu_ps(r, red);
-            _mm256_storeu_ps(g, green);
-            _mm256_storeu_ps(b, blue);
-            if (with_depth) _mm256_storeu_ps(z, depth);
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), found = gsf__entries_of_avx2(&entries, s);
+            if (!found || gsf__blend_step_avx2(&entries, found, s, state, with_depth, 0)) continue;
+            if (!gsf__blend_step_avx2(&entries, found, s, state, with_depth, 1)) live &= ~(1u << s);
         }
     }
 }
@@ -8931,49 +8937,60 @@ GSF__INLINE_AVX512 uint32_t gsf__live_avx512(const float* T) { // bits as in gsf
     return live;
 }
 
-// As gsf__blend_avx2_body, with a block in place of a step.
+// The entries that overlap the block with this number, which is its bit.
+GSF__INLINE_AVX512 uint32_t gsf__entries_of_avx512(const gsf__entries* entries, uint32_t number) {
+    const __m512i bit = _mm512_set1_epi32((int)(1u << number));
+    return (uint32_t)_mm512_test_epi32_mask(_mm512_loadu_si512(entries->overlaps), bit) |
+           (uint32_t)_mm512_test_epi32_mask(_mm512_loadu_si512(entries->overlaps + 16), bit) << 16;
+}
+
+// As gsf__blend_step_avx2, with a block in place of a step.
+GSF__INLINE_AVX512 int gsf__blend_block_avx512(const gsf__entries* entries, uint32_t left, uint32_t block,
+                                               gsf__tile_state* state, int with_depth, int closing) {
+    float *r = state->r + 16 * block, *g = state->g + 16 * block, *b = state->b + 16 * block, *z = state->z + 16 * block;
+    const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2)), least = _mm512_set1_ps(GSF__T_MIN);
+    __m512 last = _mm512_loadu_ps(state->T + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
+    __m512 red = _mm512_loadu_ps(r), green = _mm512_loadu_ps(g), blue = _mm512_loadu_ps(b), depth = _mm512_loadu_ps(z);
+    __mmask16 shown = 0;
+    for (; left; left &= left - 1) {
+        const size_t at = (size_t)gsf__lowest_bit(left);
+        const gsf__record* rec = entries->rec[at];
+        const __m512 raw = gsf__alpha_avx512(entries, at, columns, 4 * (block & 3));
+        const __m512 alpha = _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), next = _mm512_fnmadd_ps(T, alpha, T);
+        __m512 w = _mm512_mul_ps(T, alpha);
+        if (closing) {
+            shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
+            w = _mm512_maskz_mov_ps(shown, w);
+            last = _mm512_mask_mov_ps(last, shown, next);
+        }
+        red = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->r), red);
+        green = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->g), green);
+        blue = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->b), blue);
+        if (with_depth) depth = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->depth), depth);
+        T = next;
+    }
+    if (closing) T = _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f));
+    else if (_mm512_cmp_ps_mask(T, least, _CMP_GE_OQ) != 0xffff) return 0;
+    _mm512_storeu_ps(state->T + 16 * block, T);
+    _mm512_storeu_ps(r, red);
+    _mm512_storeu_ps(g, green);
+    _mm512_storeu_ps(b, blue);
+    if (with_depth) _mm512_storeu_ps(z, depth);
+    return !closing || shown != 0;
+}
+
+// As gsf__blend_avx2_body.
 GSF__INLINE_AVX512 void gsf__blend_avx512_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
     gsf__entries entries;
-    const __m512 least = _mm512_set1_ps(GSF__T_MIN);
     uint32_t live = gsf__live_avx512(state->T);
     for (size_t i = 0, end; i < tile->count && live; i = end) {
         end = i + GSF__TOGETHER < tile->count ? i + GSF__TOGETHER : tile->count;
         gsf__find_avx512(tile, i, end, &entries);
-        const __m512i overlaps = _mm512_loadu_si512(entries.overlaps), more = _mm512_loadu_si512(entries.overlaps + 16);
         for (uint32_t m = live; m; m &= m - 1) {
             const uint32_t number = (uint32_t)gsf__lowest_bit(m), block = (number & 3) << 2 | number >> 2;
-            const __m512i bit = _mm512_set1_epi32((int)(1u << number));
-            uint32_t left = (uint32_t)_mm512_test_epi32_mask(overlaps, bit) |
-                            (uint32_t)_mm512_test_epi32_mask(more, bit) << 16;
-            if (!left) continue;
-            float *r = state->r + 16 * block, *g = state->g + 16 * block, *b = state->b + 16 * block;
-            float* z = state->z + 16 * block;
-            const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
-            __m512 last = _mm512_loadu_ps(state->T + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
-            __m512 red = _mm512_loadu_ps(r), green = _mm512_loadu_ps(g), blue = _mm512_loadu_ps(b), depth = _mm512_loadu_ps(z);
-            __mmask16 shown;
-            do {
-                const size_t at = (size_t)gsf__lowest_bit(left);
-                const gsf__record* rec = entries.rec[at];
-                const __m512 raw = gsf__alpha_avx512(&entries, at, columns, 4 * (block & 3));
-                const __m512 alpha = _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX));
-                const __m512 next = _mm512_fnmadd_ps(T, alpha, T);
-                shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
-                const __m512 w = _mm512_maskz_mul_ps(shown, T, alpha);
-                last = _mm512_mask_mov_ps(last, shown, next);
-                red = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->r), red);
-                green = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->g), green);
-                blue = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->b), blue);
-                if (with_depth) depth = _mm512_fmadd_ps(w, _mm512_set1_ps(rec->depth), depth);
-                T = next;
-                left &= left - 1;
-            } while (left);
-            if (!shown) live &= ~(1u << number);
-            _mm512_storeu_ps(state->T + 16 * block, _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f)));
-            _mm512_storeu_ps(r, red);
-            _mm512_storeu_ps(g, green);
-            _mm512_storeu_ps(b, blue);
-            if (with_depth) _mm512_storeu_ps(z, depth);
+            const uint32_t found = gsf__entries_of_avx512(&entries, number);
+            if (!found || gsf__blend_block_avx512(&entries, found, block, state, with_depth, 0)) continue;
+            if (!gsf__blend_block_avx512(&entries, found, block, state, with_depth, 1)) live &= ~(1u << number);
         }
     }
 }
@@ -9238,82 +9255,106 @@ GSF__INLINE_AVX2 size_t gsf__reserve_steps(const gsf__entries* entries, uint32_t
     return kept;
 }
 
+// As gsf__blend_step_avx2, for T; keeps each entry's alphas and T at the place of its next step, and the entry's number, which
+// counts from `first`.
+GSF__INLINE_AVX2 int gsf__keep_step_avx2(const gsf__entries* entries, uint32_t found, uint32_t s, size_t first, float* T_tile,
+                                         size_t place[GSF__TOGETHER], gsf__step* steps, gsf__step_head* heads,
+                                         int closing) {
+    const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3)), least = _mm256_set1_ps(GSF__T_MIN);
+    __m256 last = _mm256_loadu_ps(T_tile + 8 * s), T = _mm256_max_ps(last, _mm256_setzero_ps()), shown = last;
+    for (uint32_t left = found; left; left &= left - 1) {
+        const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
+        __m256 raw = gsf__alpha_avx2(entries, at, columns, 2 * (s & 7));
+        const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T);
+        if (closing) {
+            shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
+            raw = _mm256_and_ps(shown, raw);
+            last = _mm256_blendv_ps(last, next, shown);
+        }
+        _mm256_storeu_ps(steps[k].alpha, raw);
+        _mm256_storeu_ps(steps[k].T, T);
+        heads[k].entry = (uint32_t)(first + at);
+        heads[k].step = s;
+        T = next;
+    }
+    if (closing) T = _mm256_or_ps(last, _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f)));
+    else if (_mm256_movemask_ps(_mm256_cmp_ps(T, least, _CMP_GE_OQ)) != 255) {
+        for (uint32_t left = found; left; left &= left - 1) place[gsf__lowest_bit(left)]--;
+        return 0;
+    }
+    _mm256_storeu_ps(T_tile + 8 * s, T);
+    return !closing || _mm256_movemask_ps(shown) != 0;
+}
+
 // Goes through the tile as gsf__blend_avx2_body does, step by step, but writes in the order of the list, as reverse reads.
-GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last, gsf__step* steps,
+GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps,
                                               gsf__step_head* heads, size_t* step_count) {
     gsf__entries entries;
     size_t place[GSF__TOGETHER], kept = 0, i = first;
-    const __m256 least = _mm256_set1_ps(GSF__T_MIN);
-    uint32_t live = gsf__live_avx2(T_tile);
+    uint32_t live = gsf__live_avx2(T);
     for (size_t end; i < last && live && kept <= GSF__BUCKET; i = end) {
         end = i + GSF__TOGETHER < last ? i + GSF__TOGETHER : last;
         gsf__find_avx2(tile, i, end, &entries);
         kept = gsf__reserve_steps(&entries, live, kept, place);
         for (uint32_t m = live; m; m &= m - 1) {
-            const uint32_t s = (uint32_t)gsf__lowest_bit(m);
-            uint32_t left = gsf__entries_of_avx2(&entries, s);
-            if (!left) continue;
-            const __m256 columns = _mm256_load_ps(gsf__columns_of + 16 * (s >> 3));
-            __m256 final = _mm256_loadu_ps(T_tile + 8 * s), T = _mm256_max_ps(final, _mm256_setzero_ps()), shown;
-            do {
-                const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
-                const __m256 raw = gsf__alpha_avx2(&entries, at, columns, 2 * (s & 7));
-                const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, _mm256_set1_ps(GSF__ALPHA_MAX)), T);
-                shown = _mm256_cmp_ps(next, least, _CMP_GE_OQ);
-                _mm256_storeu_ps(steps[k].alpha, _mm256_and_ps(shown, raw));
-                _mm256_storeu_ps(steps[k].T, T);
-                heads[k].entry = (uint32_t)(i + at);
-                heads[k].step = s;
-                final = _mm256_blendv_ps(final, next, shown);
-                T = next;
-                left &= left - 1;
-            } while (left);
-            if (!_mm256_movemask_ps(shown)) live &= ~(1u << s);
-            const __m256 finished = _mm256_andnot_ps(shown, _mm256_set1_ps(-0.0f));
-            _mm256_storeu_ps(T_tile + 8 * s, _mm256_or_ps(final, finished));
+            const uint32_t s = (uint32_t)gsf__lowest_bit(m), found = gsf__entries_of_avx2(&entries, s);
+            if (found && !gsf__keep_step_avx2(&entries, found, s, i, T, place, steps, heads, 0) &&
+                !gsf__keep_step_avx2(&entries, found, s, i, T, place, steps, heads, 1))
+                live &= ~(1u << s);
         }
     }
     *step_count = kept;
     return live && i < last ? i : tile->count;
 }
 
-// As gsf__keep_avx2, with a block in place of a step.
-GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
+// As gsf__keep_step_avx2, with a block in place of a step.
+GSF__INLINE_AVX512 int gsf__keep_block_avx512(const gsf__entries* entries, uint32_t found, uint32_t block, size_t first,
+                                              float* T_tile, size_t place[GSF__TOGETHER], gsf__wide_step* steps,
+                                              gsf__step_head* heads, int closing) {
+    const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2)), least = _mm512_set1_ps(GSF__T_MIN);
+    __m512 last = _mm512_loadu_ps(T_tile + 16 * block), T = _mm512_max_ps(last, _mm512_setzero_ps());
+    __mmask16 shown = 0;
+    for (uint32_t left = found; left; left &= left - 1) {
+        const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
+        __m512 raw = gsf__alpha_avx512(entries, at, columns, 4 * (block & 3));
+        const __m512 next = _mm512_fnmadd_ps(T, _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T);
+        if (closing) {
+            shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
+            raw = _mm512_maskz_mov_ps(shown, raw);
+            last = _mm512_mask_mov_ps(last, shown, next);
+        }
+        _mm512_storeu_ps(steps[k].alpha, raw);
+        _mm512_storeu_ps(steps[k].T, T);
+        heads[k].entry = (uint32_t)(first + at);
+        heads[k].step = block;
+        T = next;
+    }
+    if (closing) T = _mm512_mask_or_ps(last, (__mmask16)~shown, last, _mm512_set1_ps(-0.0f));
+    else if (_mm512_cmp_ps_mask(T, least, _CMP_GE_OQ) != 0xffff) {
+        for (uint32_t left = found; left; left &= left - 1) place[gsf__lowest_bit(left)]--;
+        return 0;
+    }
+    _mm512_storeu_ps(T_tile + 16 * block, T);
+    return !closing || shown != 0;
+}
+
+// As gsf__keep_avx2.
+GSF__TARGET_AVX512 static size_t gsf__keep_avx512(const gsf__tile* tile, float* T, size_t first, size_t last,
                                                   gsf__step* memory, gsf__step_head* heads, size_t* step_count) {
     gsf__wide_step* steps = (gsf__wide_step*)(void*)memory;
     gsf__entries entries;
     size_t place[GSF__TOGETHER], kept = 0, i = first;
-    const __m512 least = _mm512_set1_ps(GSF__T_MIN);
-    uint32_t live = gsf__live_avx512(T_tile);
+    uint32_t live = gsf__live_avx512(T);
     for (size_t end; i < last && live && kept <= GSF__BUCKET / 2; i = end) {
         end = i + GSF__TOGETHER < last ? i + GSF__TOGETHER : last;
         gsf__find_avx512(tile, i, end, &entries);
         kept = gsf__reserve_steps(&entries, live, kept, place);
-        const __m512i overlaps = _mm512_loadu_si512(entries.overlaps), more = _mm512_loadu_si512(entries.overlaps + 16);
         for (uint32_t m = live; m; m &= m - 1) {
             const uint32_t number = (uint32_t)gsf__lowest_bit(m), block = (number & 3) << 2 | number >> 2;
-            const __m512i bit = _mm512_set1_epi32((int)(1u << number));
-            uint32_t left = (uint32_t)_mm512_test_epi32_mask(overlaps, bit) |
-                            (uint32_t)_mm512_test_epi32_mask(more, bit) << 16;
-            if (!left) continue;
-            const __m512 columns = _mm512_load_ps(gsf__columns_of + 16 * (block >> 2));
-            __m512 final = _mm512_loadu_ps(T_tile + 16 * block), T = _mm512_max_ps(final, _mm512_setzero_ps());
-            __mmask16 shown;
-            do {
-                const size_t at = (size_t)gsf__lowest_bit(left), k = place[at]++;
-                const __m512 raw = gsf__alpha_avx512(&entries, at, columns, 4 * (block & 3));
-                const __m512 next = _mm512_fnmadd_ps(T, _mm512_min_ps(raw, _mm512_set1_ps(GSF__ALPHA_MAX)), T);
-                shown = _mm512_cmp_ps_mask(next, least, _CMP_GE_OQ);
-                _mm512_storeu_ps(steps[k].alpha, _mm512_maskz_mov_ps(shown, raw));
-                _mm512_storeu_ps(steps[k].T, T);
-                heads[k].entry = (uint32_t)(i + at);
-                heads[k].step = block;
-                final = _mm512_mask_mov_ps(final, shown, next);
-                T = next;
-                left &= left - 1;
-            } while (left);
-            if (!shown) live &= ~(1u << number);
-            _mm512_storeu_ps(T_tile + 16 * block, _mm512_mask_or_ps(final, (__mmask16)~shown, final, _mm512_set1_ps(-0.0f)));
+            const uint32_t found = gsf__entries_of_avx512(&entries, number);
+            if (found && !gsf__keep_block_avx512(&entries, found, block, i, T, place, steps, heads, 0) &&
+                !gsf__keep_block_avx512(&entries, found, block, i, T, place, steps, heads, 1))
+                live &= ~(1u << number);
         }
     }
     *step_count = kept;
