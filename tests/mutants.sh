@@ -33,6 +33,9 @@ gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max
 gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
 gsfixer_splat.h|test_stereo|dense points: coarse levels match grey|s/job->channels = level \? 3 : 1/job->channels = 1/
 gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/(basis\[10\] = gsf__v_set\()2\.890611442640554f/${1}-2.890611442640554f/
+gsfixer_splat.h|golden_splat|blend: a pixel that becomes finished goes on|s/(else if \(_mm256_movemask_ps\(_mm256_cmp_ps\(T, least, _CMP_GE_OQ\)\)) != 255\) return 0;/$1 > 255) return 0;/
+gsfixer_splat.h|test_stress|keep: a step that is blended again keeps the places after its own|s/place\[gsf__lowest_bit\(left\)\]--/place[gsf__lowest_bit(left)]/g
+gsfixer_splat.h|golden_splat|gather: the last sums of a slot are left out|s/PARTS = \(GSF__SLOT_SUMS \+ WIDE - 1\) \/ WIDE/PARTS = GSF__SLOT_SUMS \/ 2 \/ WIDE/
 gsfixer_splat.h|golden_splat|densification splits what it should clone|s/<= clone_log \? GSF__CLONE : GSF__SPLIT/<= clone_log ? GSF__SPLIT : GSF__CLONE/
 gsfixer_splat.h|golden_splat|opacity reset raises opacities|s/if \(group->value\[i\] > logit\)/if (group->value[i] < logit)/
 gsfixer_splat.h|golden_splat|opacity reset keeps the second moments|s/(group->value\[i\] = logit;\s*memset\(group->m,[^;]*;)\s*memset\(group->v,[^;]*;/$1/
