@@ -1,7 +1,8 @@
 // bench_splat.c - run time and error of the splat code.
 // By hand: cc -O2 -fopenmp -I. bench/bench_splat.c -o bench_splat -lm
 //
-//     bench_splat [--json] [--quick] [--filter TEXT] [--threads N] [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]
+//     bench_splat [--json] [--quick] [--filter TEXT] [--threads N]
+//                 [--scene COLMAP [--views FILE] [--start PLY] [--steps N] [--isa scalar|avx2|avx512]]
 //     bench_splat --growth [--json]
 //     bench_splat --stereo COLMAP [--photos N] [--max-size PIXELS]
 //
@@ -30,6 +31,7 @@
 
 typedef struct bench_options {
     int json, quick, growth, threads, steps, photos, max_size;
+    gsf_cpu_level level; // of --scene
     const char *filter, *scene, *views, *start, *stereo;
 } bench_options;
 
@@ -668,6 +670,7 @@ static void bench_training(const bench_options* o) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     ctx.threads = o->threads;
+    ctx.cpu_level = o->level;
     bench_require(&ctx, gsf_init_context(&ctx));
     gsf_scene scene;
     bench_require(&ctx, gsf_splat_load_scene(&ctx, o->scene, NULL, &scene));
@@ -821,12 +824,14 @@ int main(int argc, char** argv) {
         else if (value && strcmp(argv[i], "--views") == 0) o.views = argv[++i];
         else if (value && strcmp(argv[i], "--start") == 0) o.start = argv[++i];
         else if (value && strcmp(argv[i], "--steps") == 0 && atoi(value) > 0) o.steps = atoi(argv[++i]);
+        else if (value && strcmp(argv[i], "--isa") == 0 && bench_level_of(value) != GSF_CPU_AUTO)
+            o.level = bench_level_of(argv[++i]);
         else if (value && strcmp(argv[i], "--stereo") == 0) o.stereo = argv[++i];
         else if (value && strcmp(argv[i], "--photos") == 0 && atoi(value) > 1) o.photos = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--max-size") == 0 && atoi(value) > 0) o.max_size = atoi(argv[++i]);
         else {
             fprintf(stderr, "usage: bench_splat [--json] [--quick] [--growth] [--filter TEXT] [--threads N]\n"
-                            "                   [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]\n"
+                            "                   [--scene COLMAP [--views FILE] [--start PLY] [--steps N] [--isa scalar|avx2|avx512]]\n"
                             "                   [--stereo COLMAP [--photos N] [--max-size PIXELS]]\n");
             return 2;
         }
