@@ -167,7 +167,8 @@ typedef enum gsf_cpu_level { // instruction sets that kernels may use; AUTO sele
     GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
     GSF_CPU_AVX512_VNNI = 4, // AVX512 and 8-bit dot products
     GSF_CPU_AVX512_BF16 = 5, // AVX512_VNNI and bfloat16 dot products; not by AUTO where these are slower than float32
-    GSF_CPU_SIMD128 = 6,     // four lanes: NEON of 64-bit Arm, SIMD128 of WebAssembly (which is chosen when compiling)
+    GSF_CPU_AMX = 6,         // AVX512_BF16 and bfloat16 products of tiles; gsf_init_context asks Linux to save the tiles
+    GSF_CPU_SIMD128 = 7,     // four lanes: NEON of 64-bit Arm, SIMD128 of WebAssembly (which is chosen when compiling)
 } gsf_cpu_level;
 
 typedef enum gsf_log_level { GSF_LOG_ERROR = 0, GSF_LOG_WARNING = 1, GSF_LOG_INFO = 2 } gsf_log_level;
@@ -233,7 +234,8 @@ GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
 GSF_API int32_t gsf_is_cancelled(const gsf_context* ctx);
 
-// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16", "simd128").
+// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16", "amx",
+// "simd128").
 GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
@@ -683,13 +685,22 @@ __asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
 #define GSF__INLINE_VNNI GSF__TARGET_VNNI GSF__ALWAYS_INLINE static inline
 #define GSF__TARGET_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16")))
 #define GSF__INLINE_BF16 GSF__TARGET_BF16 GSF__ALWAYS_INLINE static inline
+#if defined(__linux__) && defined(__x86_64__) && !defined(__ILP32__) && \
+    ((defined(__clang__) && __clang_major__ >= 12) || (!defined(__clang__) && __GNUC__ >= 11))
+#define GSF__AMX 1
+#define GSF__TARGET_AMX __attribute__((target(GSF__AVX512 ",avx512bf16,amx-tile,amx-bf16")))
+#define GSF__INLINE_AMX GSF__TARGET_AMX GSF__ALWAYS_INLINE static inline
+#else
+#define GSF__AMX 0
+#endif
 #ifdef GSF_NO_AVX512 // nothing refers to the kernels, so that compilers drop them
 #define GSF__REACHES(level, wanted) 0
 #else
-#define GSF__REACHES(level, wanted) ((level) >= GSF_CPU_##wanted) // for AVX512, AVX512_VNNI, AVX512_BF16
+#define GSF__REACHES(level, wanted) ((level) >= GSF_CPU_##wanted) // for AVX512, AVX512_VNNI, AVX512_BF16, AMX
 #endif
 #else
 #define GSF__X86 0
+#define GSF__AMX 0
 #endif
 
 // Four lanes: NEON of 64-bit Arm, which always has it, or SIMD128 of WebAssembly (-msimd128).
@@ -2629,6 +2640,7 @@ GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level) {
         case GSF_CPU_AVX512: return "avx512";
         case GSF_CPU_AVX512_VNNI: return "avx512_vnni";
         case GSF_CPU_AVX512_BF16: return "avx512_bf16";
+        case GSF_CPU_AMX: return "amx";
         case GSF_CPU_SIMD128: return "simd128";
     }
     return "unknown";
@@ -2660,13 +2672,25 @@ static uint64_t gsf__saved_state(void) {
 }
 #endif
 
+// Whether threads of this process may use tiles: Linux wants to be asked, as they enlarge what it saves of a thread.
+static int gsf__may_use_tiles(void) {
+#if GSF__AMX
+    long result = 158; // arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)
+    __asm__ volatile("syscall" : "+a"(result) : "D"(0x1023l), "S"(18l) : "rcx", "r11", "memory");
+    return result == 0;
+#else
+    return 0;
+#endif
+}
+
 // By cpuid itself: __builtin_cpu_supports needs a run-time library that clang-cl does not link.
 static gsf_cpu_level gsf__detect_cpu_level(void) {
 #if GSF__X86
     const unsigned fma = 1u << 12, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;             // leaf 1, ecx
     const unsigned bmi = 1u << 3, avx2 = 1u << 5, f_dq = 1u << 16 | 1u << 17, bw_vl = 3u << 30;     // leaf 7, ebx
     const unsigned vnni = 1u << 11, bf16 = 1u << 5;                                                 // ecx; leaf 7.1, eax
-    const uint64_t ymm = 6, zmm = 0xe6;                                                             // in XCR0
+    const unsigned amx = 1u << 22 | 1u << 24;                                                       // leaf 7, edx
+    const uint64_t ymm = 6, zmm = 0xe6, tiles = 0x60000;                                            // in XCR0
     unsigned one[4], seven[4], more[4];
     gsf__cpuid(1, 0, one);
     gsf__cpuid(7, 0, seven);
@@ -2678,7 +2702,9 @@ static gsf_cpu_level gsf__detect_cpu_level(void) {
     if ((saved & zmm) != zmm || (seven[1] & (f_dq | bw_vl)) != (f_dq | bw_vl)) return GSF_CPU_AVX2;
     if (!GSF__REACHES(GSF_CPU_AVX512, AVX512)) return GSF_CPU_AVX2;
     if (!(seven[2] & vnni)) return GSF_CPU_AVX512;
-    return more[0] & bf16 ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
+    if (!(more[0] & bf16)) return GSF_CPU_AVX512_VNNI;
+    const int has_tiles = (seven[3] & amx) == amx && (saved & tiles) == tiles;
+    return has_tiles && gsf__may_use_tiles() ? GSF_CPU_AMX : GSF_CPU_AVX512_BF16;
 #else
     return GSF__SIMD128 ? GSF_CPU_SIMD128 : GSF_CPU_SCALAR;
 #endif

@@ -390,7 +390,8 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
     double norm_eps;
     gsf_nn_weights weights;
     int32_t bf16;                                           // the `bf16` member of its linear layers and attention, for
-                                                            // speed: see GSF_CPU_AVX512_BF16; may be changed at any time
+                                                            // speed: see GSF_CPU_AVX512_BF16 and AMX; in training, all
+                                                            // products (GSF__NN_BF16_ALL). May be changed at any time
     void* nets;                                             // private
 } gsf_nn_transformer;
 
@@ -743,9 +744,12 @@ typedef struct gsf__nn_linear_desc {
     int32_t transposed_x;      // x is (in, rows), row stride ldx, 0: rows
     int32_t transposed_weight; // weight is (in, out), row stride ldw, 0: out
     int64_t ldw;
-    int32_t bf16;              // for bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: also rounds x to bf16, sums
-                               // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
+    int32_t bf16;              // from GSF_CPU_AVX512_BF16 on, for more than 4 rows: 1: if the weights are bf16 and not
+                               // transposed, x is rounded to bf16, too; GSF__NN_BF16_ALL: x and weights of any type are.
+                               // Products are summed in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
+
+enum { GSF__NN_BF16_ALL = 2 };
 
 typedef struct gsf__nn_quantized { // an 8-bit weight matrix; owns its memory: destroy it
     int64_t out, in;
@@ -767,7 +771,7 @@ typedef struct gsf__nn_attention_desc {
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
     float* lse;                // NULL, or (heads, queries): what gsf__nn_attention_grad needs to recompute the weights
-    int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: rounds q, k, v and the softmax weights to bf16
+    int32_t bf16;              // from GSF_CPU_AVX512_BF16 on, even head_dim: rounds q, k, v and the softmax weights to bf16
 } gsf__nn_attention_desc;
 
 // ---- convolution ----
@@ -3764,10 +3768,10 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 // A block of a few hundred rows and outputs is one unit of parallel work. It traverses the inner dimension in steps of
 // `depth`, so that this much of its rows fits the L2 cache and of one panel the L1 cache; each tile of 6 x 16 sums is
 // held in registers. AVX-512 computes two groups by two panels at a time, 12 x 32 sums, on request with pairs of bf16
-// in the place of floats. After the last step a tile goes through bias, activation, gate and residual into y while it
-// is still in cache. The weights are packed once per call for all blocks, or, if one block covers all rows, by the
-// worker that needs them. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are not packed
-// but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result
+// in the place of floats, AMX such pairs of groups of 16 rows. After the last step a tile goes through bias, activation, gate
+// and residual into y while it is still in cache. The weights are packed once per call for all blocks, or, if one block covers
+// all rows, by the worker that needs them. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are
+// not packed but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result
 // does not depend on the number of workers.
 
 enum {
@@ -3797,14 +3801,17 @@ enum {
 
 typedef struct gsf__linear_job gsf__linear_job;
 
-typedef struct gsf__linear_kernels { // one set per instruction set
+typedef struct gsf__linear_kernels { // one set per instruction set; `count`: values
     // out[k][16]: `columns` rows of weights, `pitch` bytes apart, transposed; missing columns are zero
     void (*pack_weights)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
     // The same from weights that are stored transposed, `count` rows of `columns`
     void (*pack_transposed)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
     // out[k][6]: `rows` rows of x, transposed; missing rows are zero; may write two floats more
     void (*pack_rows)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
-    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; also prefetches `ahead_count` floats that are needed next
+    // The same from x that is stored transposed, `count` rows of `rows`
+    void (*pack_columns)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
+    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; also prefetches `ahead_count` floats that are needed next.
+    // Here `count` is of packed values
     void (*tile)(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
                  int64_t ahead_count);
     // The same for two consecutive groups and two panels, whose sums are `next` floats apart; may be NULL
@@ -3817,6 +3824,9 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     void (*gemv)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
     int64_t gemv_lanes; // layout of job->gemv_x, which `gemv` reads: [k / lanes][rows][lanes]; 0: it reads desc.x
     int64_t unit;      // values per packed float: 1, or 2 in bf16; counts of packed values are in units
+    int64_t height;    // rows of a group: 6 or, as tiles, 16
+    int64_t step;      // packed values come in multiples of this, filled up with zeros
+    void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__linear_kernels;
 
 typedef struct gsf__linear_plan { // how a product is divided; depends on its sizes only
@@ -3832,7 +3842,7 @@ struct gsf__linear_job {
     gsf__linear_plan plan;
     const gsf__linear_kernels* kernels;
     int64_t in, out, ldw;
-    int64_t length;               // `in` in units
+    int64_t length;               // `in` in units, rounded up
     int64_t first, columns;       // the current group of outputs
     float *bias, *packed, *gemv_x; // bias: zeros if there is none, 16 more than `out`
     float* workers;
@@ -3895,6 +3905,13 @@ static void gsf__pack_rows_scalar(const float* x, int64_t ldx, int64_t rows, int
         for (int64_t k = 0; k < count; k++) out[k * GSF__TILE_ROWS + r] = r < rows ? x[r * ldx + k] : 0.0f;
 }
 
+static void gsf__pack_columns_scalar(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
+    for (int64_t k = 0; k < count; k++, x += ldx, out += GSF__TILE_ROWS) {
+        if (rows == GSF__TILE_ROWS) memcpy(out, x, GSF__TILE_ROWS * sizeof *out);
+        for (int64_t r = 0; rows < GSF__TILE_ROWS && r < GSF__TILE_ROWS; r++) out[r] = r < rows ? x[r] : 0.0f;
+    }
+}
+
 static void gsf__tile_scalar(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
                              int64_t ahead_count) {
     float c[GSF__TILE_SUMS];
@@ -3933,8 +3950,8 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 }
 
 static const gsf__linear_kernels gsf__linear_scalar = {
-    gsf__pack_weights_scalar, gsf__pack_transposed_scalar, gsf__pack_rows_scalar, gsf__tile_scalar, NULL,
-    gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
+    gsf__pack_weights_scalar, gsf__pack_transposed_scalar, gsf__pack_rows_scalar, gsf__pack_columns_scalar,
+    gsf__tile_scalar, NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1, GSF__TILE_ROWS, 1, NULL, NULL};
 
 // ---- linear: where kernels are compiled for the instruction sets
 // Those of all sections written in the vector vocabulary, except the gradients' of >>nn training: one inclusion for all, as
@@ -4252,8 +4269,8 @@ GSF__TARGET_AVX2 static void gsf__gemv_avx2(const gsf__linear_job* job, int64_t 
 }
 
 static const gsf__linear_kernels gsf__linear_avx2 = {
-    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__tile_avx2, NULL, gsf__epilogue_avx2,
-    gsf__gemv_avx2, 8, 1};
+    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
+    gsf__tile_avx2, NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1, GSF__TILE_ROWS, 1, NULL, NULL};
 
 // ---- linear: AVX-512 kernels
 
@@ -4459,34 +4476,92 @@ GSF__TARGET_AVX512 static void gsf__gemv_avx512(const gsf__linear_job* job, int6
 }
 
 static const gsf__linear_kernels gsf__linear_avx512 = {
-    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__tile_avx2, gsf__four_tiles_avx512,
-    gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1};
+    gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
+    gsf__tile_avx2, gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1, GSF__TILE_ROWS, 1, NULL, NULL};
 
 // ---- linear: kernels for pairs of bf16
 
-// The weights are already stored as pairs.
-static void gsf__pack_weights_bf16(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count,
-                                   float* out) {
-    (void)dtype;
-    gsf__pack_weights_avx2(w, GSF_NN_F32, pitch, columns, count, out);
+// The first `left` of sixteen values, none if negative; zeros after them.
+GSF__INLINE_BF16 __m512 gsf__load_first16(const char* p, gsf_nn_dtype dtype, int64_t left) {
+    const __mmask16 mask = gsf__nn_mask16(left > 0 ? left : 0);
+    if (dtype == GSF_NN_F32) return _mm512_maskz_loadu_ps(mask, p);
+    const __m256i bits = _mm256_maskz_loadu_epi16(mask, p);
+    if (dtype == GSF_NN_F16) return _mm512_cvtph_ps(bits);
+    return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
 }
 
-// Eight units of a row with `values` values, from value `first` on; zeros beyond the end.
-GSF__INLINE_BF16 __m256 gsf__bf16_units(const float* row, int64_t first, int64_t values) {
-    const __m512 v = _mm512_maskz_loadu_ps(gsf__nn_mask16(values > first ? values - first : 0), row + first);
-    return _mm256_castsi256_ps(gsf__nn_round_bf16(v));
+// Sixteen pairs of neighbours.
+GSF__INLINE_BF16 __m512 gsf__pairs_along(const char* p, gsf_nn_dtype dtype, size_t size, int64_t left) {
+    const __m512 low = gsf__load_first16(p, dtype, left), high = gsf__load_first16(p + 16 * size, dtype, left - 16);
+    return _mm512_castsi512_ps((__m512i)_mm512_cvtne2ps_pbh(high, low));
+}
+
+// Pairs of a value and that of the next row, for sixteen columns; `left` rows exist.
+GSF__INLINE_BF16 __m512 gsf__pairs_across(const char* p, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t left) {
+    const __m512 low = gsf__load_first16(p, dtype, left > 0 ? columns : 0);
+    const __m512 high = gsf__load_first16(p + pitch, dtype, left > 1 ? columns : 0);
+    const __m512i first = _mm512_cvtepu16_epi32(gsf__nn_round_bf16(low));
+    const __m512i second = _mm512_cvtepu16_epi32(gsf__nn_round_bf16(high));
+    return _mm512_castsi512_ps(_mm512_or_si512(first, _mm512_slli_epi32(second, 16)));
+}
+
+// to[i][j] = m[j][i]
+GSF__INLINE_BF16 void gsf__store_turned16(__m512 m[16], float* to) {
+    gsf__v_transpose_avx512(m);
+    for (int i = 0; i < 16; i++) _mm512_storeu_ps(to + 16 * i, m[i]);
+}
+
+GSF__INLINE_BF16 void gsf__pack_pairs_along(const char* w, gsf_nn_dtype dtype, size_t size, size_t pitch, int64_t columns,
+                                            int64_t count, float* out) {
+    for (int64_t k = 0; k < count; k += 32, out += 16 * GSF__TILE_COLUMNS) {
+        __m512 m[16];
+        for (int64_t c = 0; c < 16; c++)
+            m[c] = gsf__pairs_along(w + (size_t)c * pitch + (size_t)k * size, dtype, size, c < columns ? count - k : 0);
+        gsf__store_turned16(m, out);
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__pack_weights_bf16(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns,
+                                                    int64_t count, float* out) {
+    if (dtype == GSF_NN_F32) gsf__pack_pairs_along(w, GSF_NN_F32, 4, pitch, columns, count, out);
+    else if (dtype == GSF_NN_BF16) gsf__pack_pairs_along(w, GSF_NN_BF16, 2, pitch, columns, count, out);
+    else gsf__pack_pairs_along(w, GSF_NN_F16, 2, pitch, columns, count, out);
+}
+
+GSF__TARGET_BF16 static void gsf__pack_transposed_bf16(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns,
+                                                       int64_t count, float* out) {
+    const int64_t end = gsf__round_up(count, 32);
+    for (int64_t k = 0; k < end; k += 2, out += GSF__TILE_COLUMNS) {
+        const char* p = w + (size_t)(k < count ? k : 0) * pitch;
+        __m512 v;
+        if (dtype == GSF_NN_F32) v = gsf__pairs_across(p, GSF_NN_F32, k + 1 < count ? pitch : 0, columns, count - k);
+        else if (dtype == GSF_NN_BF16) v = gsf__pairs_across(p, GSF_NN_BF16, k + 1 < count ? pitch : 0, columns, count - k);
+        else v = gsf__pairs_across(p, GSF_NN_F16, k + 1 < count ? pitch : 0, columns, count - k);
+        _mm512_storeu_ps(out, v);
+    }
 }
 
 GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
-    float tile[8 * GSF__TILE_ROWS + 2];
-    for (int64_t k = 0; k < count; k += 8, out += 8 * GSF__TILE_ROWS) {
-#define GSF_X(i) gsf__bf16_units(x + (i) * ldx, 2 * k, i < rows ? 2 * count : 0)
-        __m256 r[8] = {GSF_X(0), GSF_X(1), GSF_X(2),            GSF_X(3),
-                       GSF_X(4), GSF_X(5), _mm256_setzero_ps(), _mm256_setzero_ps()};
-#undef GSF_X
-        float* to = k + 8 <= count ? out : tile;
-        gsf__nn_store_columns(r, to, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
-        if (to == tile) memcpy(out, tile, (size_t)((count - k) * GSF__TILE_ROWS) * sizeof(float));
+    float units[8][16];
+    for (int64_t k = 0; k < count; k += 32, out += 16 * GSF__TILE_ROWS) {
+        for (int64_t r = 0; r < 8; r++) {
+            const int there = r < gsf__least(rows, GSF__TILE_ROWS);
+            _mm512_storeu_ps(units[r], gsf__pairs_along((const char*)(x + (there ? r * ldx + k : 0)), GSF_NN_F32, 4,
+                                                        there ? count - k : 0));
+        }
+        const __m256 none = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
+        gsf__nn_transpose8(units[0], 16, none, one, out, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
+        gsf__nn_transpose8(units[0] + 8, 16, none, one, out + 8 * GSF__TILE_ROWS, GSF__TILE_ROWS);
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__pack_columns_bf16(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
+    const int64_t end = gsf__round_up(count, 32);
+    for (int64_t k = 0; k < end; k += 2, out += GSF__TILE_ROWS) {
+        const float* p = x + (k < count ? k * ldx : 0);
+        const size_t pitch = k + 1 < count ? (size_t)ldx * sizeof *x : 0;
+        _mm512_mask_storeu_ps(out, (1u << GSF__TILE_ROWS) - 1,
+                              gsf__pairs_across((const char*)p, GSF_NN_F32, pitch, rows, count - k));
     }
 }
 
@@ -4518,12 +4593,114 @@ GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b
 }
 
 static const gsf__linear_kernels gsf__linear_bf16 = {
-    gsf__pack_weights_bf16, NULL, gsf__pack_rows_bf16, gsf__tile_bf16, gsf__four_tiles_bf16, gsf__epilogue_avx512,
-    gsf__gemv_avx512, 16, 2};
+    gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_bf16, gsf__pack_columns_bf16, gsf__tile_bf16,
+    gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__TILE_ROWS, 16, NULL, NULL};
+
+#endif // GSF__X86
+
+// ---- linear: kernels for tiles of bf16 (AMX)
+//
+// A tile is 16 rows of 64 bytes: of x [row][16 pairs], so that a group is [k / 16][16][16]; of a panel [pair][16]; of the
+// sums [row][16]. Tiles 0 to 3 hold sums, 4 and 5 two groups, 6 and 7 two panels.
+
+#if GSF__AMX
+
+enum { GSF__AMX_ROWS = 16, GSF__AMX_TILE = 256 }; // floats or pairs
+
+// GCC's loads of tiles do not tell it that they read memory.
+#define GSF__AMX_FENCE __asm__ volatile("" ::: "memory");
+
+GSF__TARGET_AMX static void gsf__enter_tiles(void) {
+    static const struct { uint8_t palette, start, reserved[14]; uint16_t bytes[16]; uint8_t rows[16]; } shape = {
+        1, 0, {0}, {64, 64, 64, 64, 64, 64, 64, 64, 0}, {16, 16, 16, 16, 16, 16, 16, 16, 0}};
+    GSF__AMX_FENCE
+    _tile_loadconfig(&shape);
+}
+
+GSF__TARGET_AMX static void gsf__leave_tiles(void) { _tile_release(); }
+
+GSF__TARGET_BF16 static void gsf__pack_rows_amx(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
+    for (int64_t k = 0; k < count; k += 32)
+        for (int64_t r = 0; r < GSF__AMX_ROWS; r++, out += 16) {
+            const float* p = x + (r < rows ? r * ldx + k : 0);
+            _mm512_storeu_ps(out, gsf__pairs_along((const char*)p, GSF_NN_F32, 4, r < rows ? count - k : 0));
+        }
+}
+
+GSF__TARGET_BF16 static void gsf__pack_columns_amx(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
+    for (int64_t k = 0; k < count; k += 32, out += GSF__AMX_TILE) {
+        __m512 m[16];
+        for (int64_t u = 0; u < 16; u++) {
+            const int64_t row = k + 2 * u;
+            const char* p = (const char*)(x + (row < count ? row * ldx : 0));
+            m[u] = gsf__pairs_across(p, GSF_NN_F32, row + 1 < count ? (size_t)ldx * sizeof *x : 0, rows, count - row);
+        }
+        gsf__store_turned16(m, out);
+    }
+}
+
+GSF__TARGET_AMX static void gsf__tile_amx(const float* a, const float* b, int64_t count, int add, float* sums,
+                                          const float* ahead, int64_t ahead_count) {
+    (void)ahead; // the processor loads the tiles early enough
+    (void)ahead_count;
+    GSF__AMX_FENCE
+    if (add) _tile_loadd(0, sums, 64);
+    else _tile_zero(0);
+    for (int64_t k = 0; k < count; k += 16, a += GSF__AMX_TILE, b += GSF__AMX_TILE) {
+        _tile_loadd(4, a, 64);
+        _tile_loadd(6, b, 64);
+        _tile_dpbf16ps(0, 4, 6);
+    }
+    _tile_stored(0, sums, 64);
+    GSF__AMX_FENCE
+}
+
+GSF__TARGET_AMX static void gsf__four_tiles_amx(const float* a, const float* b, int64_t count, int add, float* sums,
+                                                int64_t next, const float* ahead, int64_t ahead_count) {
+    const int64_t across = GSF__AMX_ROWS * count;
+    float* right = sums + next;
+    (void)ahead; // as above
+    (void)ahead_count;
+    GSF__AMX_FENCE
+    if (add) {
+        _tile_loadd(0, sums, 64);
+        _tile_loadd(1, right, 64);
+        _tile_loadd(2, sums + GSF__AMX_TILE, 64);
+        _tile_loadd(3, right + GSF__AMX_TILE, 64);
+    } else {
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+    }
+    for (int64_t k = 0; k < count; k += 16, a += GSF__AMX_TILE, b += GSF__AMX_TILE) {
+        _tile_loadd(6, b, 64);
+        _tile_loadd(4, a, 64);
+        _tile_dpbf16ps(0, 4, 6);
+        _tile_loadd(7, b + across, 64);
+        _tile_dpbf16ps(1, 4, 7);
+        _tile_loadd(5, a + across, 64);
+        _tile_dpbf16ps(2, 5, 6);
+        _tile_dpbf16ps(3, 5, 7);
+    }
+    _tile_stored(0, sums, 64);
+    _tile_stored(1, right, 64);
+    _tile_stored(2, sums + GSF__AMX_TILE, 64);
+    _tile_stored(3, right + GSF__AMX_TILE, 64);
+    GSF__AMX_FENCE
+}
+
+static const gsf__linear_kernels gsf__linear_amx = {
+    gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_amx, gsf__pack_columns_amx, gsf__tile_amx,
+    gsf__four_tiles_amx, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__AMX_ROWS, 16, gsf__enter_tiles,
+    gsf__leave_tiles};
 
 #endif
 
 static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, int pairs) { // pairs: prefer bf16
+#if GSF__AMX
+    if (GSF__REACHES(level, AMX) && pairs) return &gsf__linear_amx;
+#endif
 #if GSF__X86
     if (GSF__REACHES(level, AVX512_BF16) && pairs) return &gsf__linear_bf16;
     if (GSF__REACHES(level, AVX512)) return &gsf__linear_avx512;
@@ -4546,48 +4723,52 @@ static void gsf__pack_panel(const gsf__linear_job* job, int64_t column, int64_t 
                             float* out) {
     const gsf_nn_tensor* w = job->desc.weight;
     const size_t size = gsf_nn_get_dtype_size(w->dtype), pitch = (size_t)job->ldw * size;
-    const int64_t value = k * job->kernels->unit, width = gsf__least(columns, GSF__TILE_COLUMNS);
-    const char* data = (const char*)w->data;
-    if (job->desc.transposed_weight)
-        job->kernels->pack_transposed(data + (size_t)value * pitch + (size_t)column * size, w->dtype, pitch, width, count, out);
-    else
-        job->kernels->pack_weights(data + (size_t)column * pitch + (size_t)value * size, w->dtype, pitch, width, count, out);
+    const int64_t value = k * job->kernels->unit, values = gsf__least(count * job->kernels->unit, job->in - value);
+    const int64_t width = gsf__least(columns, GSF__TILE_COLUMNS);
+    const int turned = job->desc.transposed_weight != 0;
+    const int64_t down = turned ? value : column, right = turned ? column : value;
+    const char* from = (const char*)w->data + (size_t)down * pitch + (size_t)right * size;
+    (turned ? job->kernels->pack_transposed : job->kernels->pack_weights)(from, w->dtype, pitch, width, values, out);
 }
 
-// One step of a group: the rows from `row` on, up to 6 of them.
+// One step of a group: the rows from `row` on, up to its height.
 static void gsf__pack_group(const gsf__linear_job* job, int64_t row, int64_t rows, int64_t k, int64_t count, float* out) {
-    const int64_t height = gsf__least(rows, GSF__TILE_ROWS), ld = job->desc.ldx;
-    if (!job->desc.transposed_x) {
-        job->kernels->pack_rows(job->desc.x + row * ld + k * job->kernels->unit, ld, height, count, out);
-        return;
-    }
-    const float* x = job->desc.x + k * ld + row;
-    for (int64_t i = 0; i < count; i++, x += ld, out += GSF__TILE_ROWS) {
-        if (height == GSF__TILE_ROWS) memcpy(out, x, GSF__TILE_ROWS * sizeof *out);
-        for (int64_t r = 0; height < GSF__TILE_ROWS && r < GSF__TILE_ROWS; r++) out[r] = r < height ? x[r] : 0.0f;
-    }
+    const gsf__linear_kernels* kernels = job->kernels;
+    const int64_t height = gsf__least(rows, kernels->height), ld = job->desc.ldx, value = k * kernels->unit;
+    const int64_t values = gsf__least(count * kernels->unit, job->in - value);
+    if (job->desc.transposed_x) kernels->pack_columns(job->desc.x + value * ld + row, ld, height, values, out);
+    else kernels->pack_rows(job->desc.x + row * ld + value, ld, height, values, out);
 }
 
-static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { // of the current group, its full depth
+// Outputs of a unit of packing: a panel. Transposed weights are read across their rows: several, to read more of each page.
+static int64_t gsf__linear_packed_at_once(const gsf__linear_job* job) {
+    return job->desc.transposed_weight ? 4 * GSF__TILE_COLUMNS : GSF__TILE_COLUMNS;
+}
+
+static void gsf__linear_pack_panels(void* arg, size_t index, int32_t worker) { // of the current group, their full depth
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
-    const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS;
+    const int64_t width = gsf__linear_packed_at_once(job), first = (int64_t)index * width;
+    const int64_t end = gsf__least(first + width, job->columns);
     (void)worker;
     for (int64_t k = 0; k < job->length; k += job->plan.depth) {
         const int64_t count = gsf__least(job->length - k, job->plan.depth);
-        gsf__pack_panel(job, job->first + at, job->columns - at, k, count, gsf__packed_panel(job, at, k, count));
+        for (int64_t at = first; at < end; at += GSF__TILE_COLUMNS)
+            gsf__pack_panel(job, job->first + at, job->columns - at, k, count,
+                            gsf__packed_panel(job, at, k, gsf__round_up(count, job->kernels->step)));
     }
 }
 
-// All tiles of one or two panels at one step; `next` is the distance between the sums of the two.
+// All tiles of one or two panels at one step of `count` packed values; `next` is the distance between the sums of the two.
 static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t next,
                                int64_t k, int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
     const gsf__linear_kernels* kernels = job->kernels;
-    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const int64_t height = kernels->height, tile = height * GSF__TILE_COLUMNS;
+    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, height);
     const float* ahead = w + panels * count * GSF__TILE_COLUMNS; // usually the panels after these
     const int64_t share = job->plan.lone ? 0 : gsf__round_up(gsf__ceil_div(panels * count * GSF__TILE_COLUMNS, groups), 16);
     for (int64_t g = 0, step; g < groups; g += step) {
-        const float* a = x + g * GSF__TILE_ROWS * count;
-        float* s = sums + g * GSF__TILE_SUMS;
+        const float* a = x + g * height * count;
+        float* s = sums + g * tile;
         step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
         if (step == 2) kernels->four_tiles(a, w, count, k > 0, s, next, ahead + g * share, 2 * share);
         for (int64_t p = 0; step == 1 && p < panels; p++)
@@ -4595,9 +4776,9 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
                           p == 0 ? share : 0);
         if (k + count < job->length) continue;
         for (int64_t t = 0; t < step * panels; t++) {
-            const int64_t p = t / step, r = (g + t % step) * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
+            const int64_t p = t / step, r = (g + t % step) * height, c = p * GSF__TILE_COLUMNS;
             kernels->epilogue(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
-                              gsf__least(rows - r, GSF__TILE_ROWS), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
+                              gsf__least(rows - r, height), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
         }
     }
 }
@@ -4605,26 +4786,28 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
 static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a block of rows and outputs
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf__linear_plan* plan = &job->plan;
+    const gsf__linear_kernels* kernels = job->kernels;
     const int64_t row = (int64_t)index % plan->row_blocks * plan->block_rows;
     const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // within the group
     const int64_t rows = gsf__least(job->desc.rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
-    const int64_t groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const int64_t groups = gsf__ceil_div(rows, kernels->height), next = groups * kernels->height * GSF__TILE_COLUMNS;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both are padded to whole tiles
     float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
+    if (kernels->enter) kernels->enter();
     for (int64_t k = 0; k < job->length; k += plan->depth) {
-        const int64_t count = gsf__least(job->length - k, plan->depth);
-        for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS) gsf__pack_group(job, row + r, rows - r, k, count, x + r * count);
+        const int64_t count = gsf__least(job->length - k, plan->depth), padded = gsf__round_up(count, kernels->step);
+        for (int64_t r = 0; r < rows; r += kernels->height) gsf__pack_group(job, row + r, rows - r, k, count, x + r * padded);
         for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
-            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), next = groups * GSF__TILE_SUMS;
-            const int64_t column = job->first + at + c;
-            const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, count);
+            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), column = job->first + at + c;
+            const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, padded);
             for (int64_t p = 0; plan->lone && p < width; p += GSF__TILE_COLUMNS)
-                gsf__pack_panel(job, column + p, width - p, k, count, panel + p * count);
-            gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, count, row, rows, column, width);
+                gsf__pack_panel(job, column + p, width - p, k, count, panel + p * padded);
+            gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, padded, row, rows, column, width);
         }
     }
+    if (kernels->leave) kernels->leave();
 }
 
 static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some outputs, all rows
@@ -4648,8 +4831,9 @@ static void gsf__gemv_order(gsf__linear_job* job) {
     while (lanes > 0 && to < end) *to++ = 0.0f;
 }
 
-// Plans (rows, in) x (out, in)^T; returns 0 if the size of the scratch memory overflows.
-static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight_size, int gemv, gsf__linear_plan* plan) {
+// Plans (rows, in) x (out, in)^T, `in` in units; returns 0 if the size of the scratch memory overflows.
+static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, int64_t in, int64_t out, size_t weight_size,
+                            int gemv, gsf__linear_plan* plan) {
     memset(plan, 0, sizeof *plan);
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
     size_t shared = 0;
@@ -4661,17 +4845,18 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
         shared = (size_t)gsf__round_up(in, GSF__GEMV_PAD) * GSF__GEMV_ROWS;
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
-        plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, 8);
-        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : GSF__LINEAR_ROWS, 2 * GSF__TILE_ROWS);
+        plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, kernels->step > 8 ? kernels->step : 8);
+        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : GSF__LINEAR_ROWS, 2 * kernels->height);
         plan->row_blocks = gsf__ceil_div(rows, plan->block_rows);
         const int64_t most = GSF__LINEAR_PACKED / in / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
-        const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : GSF__LINEAR_COLUMNS;
+        const int64_t more = kernels->enter ? 2 : 1; // tiles are fast compared to packing the rows for each block
+        const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : more * GSF__LINEAR_COLUMNS;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
         const int64_t packed = gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS);
         if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__LINEAR_PAIR);
-        else if (!gsf__mul_size((size_t)packed, (size_t)in, &shared)) return 0;
+        else if (!gsf__mul_size((size_t)packed, (size_t)gsf__round_up(in, kernels->step), &shared)) return 0;
     }
     plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers start on cache lines
     plan->shared = shared + (size_t)gsf__round_up(out + 16, 16);
@@ -4711,7 +4896,8 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     for (job->first = 0; job->first < job->out; job->first += plan->group_columns) {
         job->columns = gsf__least(job->out - job->first, plan->group_columns);
         if (!plan->lone)
-            gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->columns, GSF__TILE_COLUMNS), gsf__linear_pack_panel, job);
+            gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->columns, gsf__linear_packed_at_once(job)),
+                              gsf__linear_pack_panels, job);
         const int64_t blocks = plan->row_blocks * gsf__ceil_div(job->columns, plan->block_columns);
         gsf__parallel_for(ctx, (size_t)blocks, gsf__linear_block, job);
     }
@@ -4732,10 +4918,11 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
     job.ldw = !desc->transposed_weight ? job.in : desc->ldw ? desc->ldw : job.out;
     const int turned = desc->transposed_x || desc->transposed_weight;
     const int gemv = desc->rows <= GSF__GEMV_ROWS && !turned;
-    const int pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0 && !turned;
+    const int pairs = desc->bf16 == GSF__NN_BF16_ALL || (desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && !turned);
     job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !gemv);
-    job.length = job.in / job.kernels->unit;
-    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), gemv, &job.plan) ||
+    job.length = gsf__ceil_div(job.in, job.kernels->unit);
+    if (!gsf__plan_linear(job.kernels, desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), gemv,
+                          &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
         floats > SIZE_MAX - job.plan.shared || !gsf__mul_size(floats + job.plan.shared, sizeof(float), &bytes))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows x %lld x %lld", (long long)desc->rows,
@@ -5521,14 +5708,14 @@ static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* w
        q    [group][dim][8], 6 used    out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
        k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key]
    AVX-512 computes two groups by two panels at a time. In bf16 each float slot holds a pair of values: of q and k along
-   dim, of v and the weights along the keys. This halves the number of slots. */
+   dim, of v and the weights along the keys. This halves the number of slots. With tiles (AMX) a group has 16 queries, and q
+   is [group][16][dim]. */
 enum {
     GSF__ATT_GROUP = 6,       // queries per register tile: 6 x 16 sums, two vectors of keys, a broadcast: 15 registers
     GSF__ATT_PANEL = 16,
     GSF__ATT_KEYS = 256,      // keys per block
-    GSF__ATT_GROUPS = 8,      // groups of queries whose weights are in memory at a time
     GSF__ATT_TILE = GSF__ATT_GROUP * GSF__ATT_PANEL,
-    GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
+    GSF__ATT_QUERIES = 48,    // whose weights are in memory at a time: whole groups of 6 or 16
     GSF__ATT_RANGE = 1536,    // queries per chunk, at most: more hide the packing better, but do not fit the cache
     GSF__ATT_LEAST_RANGE = 384,
     GSF__ATT_ROWS = 16,       // queries of the scalar kernel that are processed together for each key
@@ -5641,7 +5828,12 @@ typedef struct gsf__attention_scratch { // per worker
 } gsf__attention_scratch;
 
 typedef struct gsf__attention_parts { // what differs between instruction sets; in bf16 each float slot holds a pair
-    int64_t unit; // values per slot along head_dim: 1, or 2 in bf16
+    int64_t unit;  // values per slot along head_dim: 1, or 2 in bf16
+    int64_t group; // queries per group: GSF__ATT_GROUP, in 8 rows of slots, or 16
+    int64_t key_step; // keys are padded to a multiple of this
+    void (*enter)(void), (*leave)(void); // around a unit of work, or NULL
+    // Packs `rows` queries of a group, times factor
+    void (*pack_queries)(const float* from, int64_t rows, int64_t ld, float factor, int64_t dim, float* to);
     // Packs (x - center) * factor of eight rows, `rows` of which exist, as to[slot * to_ld + row]; center may be NULL
     void (*pack_rows)(const float* from, int64_t rows, int64_t ld, const float* center, float factor, int64_t dim, float* to,
                       int64_t to_ld);
@@ -5659,16 +5851,16 @@ typedef struct gsf__attention_parts { // what differs between instruction sets; 
 #if GSF__X86
 
 static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int32_t worker) {
-    const int64_t groups = (job->range_size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, dim = job->desc.head_dim;
+    const int64_t group = job->parts->group, groups = gsf__ceil_div(job->range_size, group), dim = job->desc.head_dim;
     gsf__attention_scratch s;
     s.p = job->scratch + (size_t)worker * job->scratch_floats;
     s.k = s.p + GSF__ATT_QUERIES * GSF__ATT_KEYS;
     s.v = s.k + GSF__ATT_KEYS * dim;
     s.out = s.v + GSF__ATT_KEYS * GSF__ATT_PANEL * job->panels;
-    s.sum = s.out + groups * GSF__ATT_TILE * job->panels;
-    s.q = s.sum + groups * GSF__ATT_GROUP * 8;
-    s.top = s.q + groups * 8 * dim;
-    s.center = s.top + groups * GSF__ATT_GROUP;
+    s.sum = s.out + groups * group * GSF__ATT_PANEL * job->panels;
+    s.q = s.sum + groups * group * 8;
+    s.top = s.q + groups * 8 * dim; // in tiles 16 rows of half as many slots
+    s.center = s.top + groups * group;
     return s;
 }
 
@@ -5698,22 +5890,30 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_rows(const float* from, int64_t
     }
 }
 
+static void gsf__attention_pack_group(const float* from, int64_t rows, int64_t ld, float factor, int64_t dim, float* to) {
+    gsf__attention_pack_rows(from, rows, ld, NULL, factor, dim, to, 8);
+}
+
+static int64_t gsf__attention_slots(const gsf__attention_parts* parts) { // rows of a packed group
+    return parts->group == GSF__ATT_GROUP ? 8 : parts->group;
+}
+
 static void gsf__attention_pack_queries(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
                                         int64_t queries, float* packed) {
     const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
     const float factor = job->desc.scale * 1.44269504f; // base 2 instead of e
-    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim / parts->unit) {
-        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
+    for (int64_t first = 0; first < queries; first += parts->group, packed += gsf__attention_slots(parts) * dim / parts->unit) {
+        for (int64_t r = first; r < first + parts->group; r++)
             gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
-        parts->pack_rows(from + first * ld, queries - first, ld, NULL, factor, dim, packed, 8);
+        parts->pack_queries(from + first * ld, queries - first, ld, factor, dim, packed);
     }
 }
 
-// Packs the keys of `from`, minus `center`, into panels of 16, padding the last one.
+// Packs the keys of `from`, minus `center`, into panels of 16, padding the last ones.
 static void gsf__attention_pack_keys(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
                                      const float* center, int64_t keys, float* packed) {
     const int64_t ld = job->desc.ldk, dim = job->desc.head_dim, panel = GSF__ATT_PANEL * dim / parts->unit;
-    for (int64_t j = 0; j < gsf__round_up(keys, GSF__ATT_PANEL); j += 8) {
+    for (int64_t j = 0; j < gsf__round_up(keys, parts->key_step); j += 8) {
         for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
         parts->pack_rows(from + j * ld, keys - j, ld, center, 1.0f, dim,
                          packed + j / GSF__ATT_PANEL * panel + j % GSF__ATT_PANEL, GSF__ATT_PANEL);
@@ -5935,6 +6135,10 @@ GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* from, int64_
     }
 }
 
+static void gsf__attention_pack_group_bf16(const float* from, int64_t rows, int64_t ld, float factor, int64_t dim, float* to) {
+    gsf__attention_pack_pairs(from, rows, ld, NULL, factor, dim, to, 8);
+}
+
 GSF__TARGET_BF16 static void gsf__attention_pack_values_bf16(const gsf__attention_job* job, const float* from, int64_t keys,
                                                              float* packed) {
     const int64_t ld = job->desc.ldv, dim = job->desc.head_dim;
@@ -6003,17 +6207,95 @@ GSF__TARGET_BF16 static void gsf__attention_values_bf16(const float* p, int64_t 
     GSF__ATT_VALUES(gsf__nn_add_pairs, gsf__attention_values_one_bf16, (keys + 1) / 2)
 }
 
+#if GSF__AMX
+
+// head_dim is a multiple of 32.
+GSF__TARGET_BF16 static void gsf__attention_pack_group_amx(const float* from, int64_t rows, int64_t ld, float factor,
+                                                           int64_t dim, float* to) {
+    const __m512 f = _mm512_set1_ps(factor);
+    for (int64_t r = 0; r < GSF__AMX_ROWS; r++, from += ld)
+        for (int64_t i = 0; i < dim; i += 16, to += 8) {
+            const __m512 v = r < rows ? _mm512_mul_ps(f, _mm512_loadu_ps(from + i)) : _mm512_setzero_ps();
+            _mm256_storeu_ps(to, _mm256_castsi256_ps(gsf__nn_round_bf16(v)));
+        }
+}
+
+static void gsf__attention_pack_values_amx(const gsf__attention_job* job, const float* from, int64_t keys, float* packed) {
+    gsf__attention_pack_values_bf16(job, from, keys, packed);
+    for (int64_t j = gsf__ceil_div(keys, 2); j < gsf__round_up(keys, 32) / 2; j++)
+        for (int64_t i = 0; i < job->panels; i++)
+            memset(packed + (i * GSF__ATT_KEYS + j) * GSF__ATT_PANEL, 0, GSF__ATT_PANEL * sizeof *packed);
+}
+
+// A group by two panels at a time.
+GSF__TARGET_AMX static void gsf__attention_logits_amx(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                      int64_t dim, float* p) {
+    const int64_t pitch = 4 * GSF__ATT_KEYS; // bytes
+    GSF__AMX_FENCE
+    for (int64_t panel = 0; panel < panels; panel += 2, k += 2 * GSF__ATT_PANEL * dim)
+        for (int64_t g = 0; g < groups; g++) {
+            float* to = p + g * GSF__AMX_ROWS * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
+            _tile_zero(0);
+            _tile_zero(1);
+            for (int64_t i = 0; i < dim; i += 16) {
+                _tile_loadd(4, q + g * GSF__AMX_ROWS * dim + i, 4 * dim);
+                _tile_loadd(6, k + i * GSF__ATT_PANEL, 64);
+                _tile_dpbf16ps(0, 4, 6);
+                _tile_loadd(7, k + (dim + i) * GSF__ATT_PANEL, 64);
+                _tile_dpbf16ps(1, 4, 7);
+            }
+            _tile_stored(0, to, pitch);
+            _tile_stored(1, to + GSF__ATT_PANEL, pitch);
+        }
+    GSF__AMX_FENCE
+}
+
+GSF__INLINE_AMX void gsf__attention_fade_amx(const float* fade, float* out) {
+    for (int r = 0; r < GSF__AMX_ROWS; r++) {
+        float* row = out + r * GSF__ATT_PANEL;
+        _mm512_storeu_ps(row, _mm512_set1_ps(fade[r]) * _mm512_loadu_ps(row));
+    }
+}
+
+// A group by two panels at a time, of which there are always pairs.
+GSF__TARGET_AMX static void gsf__attention_values_amx(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                      int64_t panels, const float* fade, float* out) {
+    const int64_t pitch = 4 * GSF__ATT_KEYS, slots = gsf__round_up(keys, 32) / 2;
+    for (int64_t panel = 0; panel < panels; panel += 2)
+        for (int64_t g = 0; g < groups; g++) {
+            const float *a = p + g * GSF__AMX_ROWS * GSF__ATT_KEYS, *b = v + panel * GSF__ATT_KEYS * GSF__ATT_PANEL;
+            float *to = out + (g * panels + panel) * GSF__AMX_TILE, *right = to + GSF__AMX_TILE;
+            gsf__attention_fade_amx(fade + g * GSF__AMX_ROWS, to);
+            gsf__attention_fade_amx(fade + g * GSF__AMX_ROWS, right);
+            GSF__AMX_FENCE
+            _tile_loadd(0, to, 64);
+            _tile_loadd(1, right, 64);
+            for (int64_t j = 0; j < slots; j += 16) {
+                _tile_loadd(4, a + j, pitch);
+                _tile_loadd(6, b + j * GSF__ATT_PANEL, 64);
+                _tile_dpbf16ps(0, 4, 6);
+                _tile_loadd(7, b + (GSF__ATT_KEYS + j) * GSF__ATT_PANEL, 64);
+                _tile_dpbf16ps(1, 4, 7);
+            }
+            _tile_stored(0, to, 64);
+            _tile_stored(1, right, 64);
+            GSF__AMX_FENCE
+        }
+}
+
+#endif
+
 GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
                                                    int64_t queries, float* out, float* lse) {
-    const int64_t dim = job->desc.head_dim, ld = job->desc.ldo;
+    const int64_t dim = job->desc.head_dim, ld = job->desc.ldo, group = job->parts->group, tile = group * GSF__ATT_PANEL;
     for (int64_t r = 0; r < queries; r++) {
         gsf__attention_fetch(out, r + GSF__ATT_AHEAD, queries, ld, dim);
         const float total = gsf__v_sum_avx2(_mm256_loadu_ps(s->sum + 8 * r));
         if (lse) lse[r] = gsf__attention_lse(s->top[r], total);
-        const float* from = s->out + r / GSF__ATT_GROUP * job->panels * GSF__ATT_TILE + r % GSF__ATT_GROUP * GSF__ATT_PANEL;
+        const float* from = s->out + r / group * job->panels * tile + r % group * GSF__ATT_PANEL;
         const __m256 divisor = _mm256_set1_ps(total);
         for (int64_t i = 0; i < dim; i += 8) {
-            const __m256 value = _mm256_loadu_ps(from + i / GSF__ATT_PANEL * GSF__ATT_TILE + i % GSF__ATT_PANEL) / divisor;
+            const __m256 value = _mm256_loadu_ps(from + i / GSF__ATT_PANEL * tile + i % GSF__ATT_PANEL) / divisor;
             _mm256_maskstore_ps(out + r * ld + i, gsf__nn_mask8(dim - i), total == 0.0f ? _mm256_setzero_ps() : value);
         }
     }
@@ -6025,50 +6307,65 @@ static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t ch
     const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t rows = gsf__least(job->range_size, d->queries - first);
-    const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
+    const int64_t group = parts->group, groups = gsf__ceil_div(rows, group), column = head * d->head_dim;
     const int64_t length = d->head_dim / parts->unit; // slots per query or key
+    const int64_t height = job->panels * group * GSF__ATT_PANEL; // of the output of a group
     float fade[GSF__ATT_QUERIES];
+    if (parts->enter) parts->enter();
     gsf__attention_center(d, column, s.center);
     gsf__attention_pack_queries(job, parts, d->q + first * d->ldq + column, rows, s.q);
-    memset(s.out, 0, (size_t)(groups * job->panels * GSF__ATT_TILE) * sizeof(float));
-    memset(s.sum, 0, (size_t)(groups * GSF__ATT_GROUP * 8) * sizeof(float));
-    for (int64_t r = 0; r < groups * GSF__ATT_GROUP; r++) s.top[r] = -FLT_MAX;
+    memset(s.out, 0, (size_t)(groups * height) * sizeof(float));
+    memset(s.sum, 0, (size_t)(groups * group * 8) * sizeof(float));
+    for (int64_t r = 0; r < groups * group; r++) s.top[r] = -FLT_MAX;
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
         const int64_t keys = gsf__least(GSF__ATT_KEYS, d->keys - key);
-        const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
+        const int64_t columns = gsf__round_up(keys, parts->key_step), key_panels = columns / GSF__ATT_PANEL;
         gsf__attention_pack_keys(job, parts, d->k + key * d->ldk + column, s.center, keys, s.k);
         parts->pack_values(job, d->v + key * d->ldv + column, keys, s.v);
-        for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
-            const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
-            parts->logits(s.q + g * 8 * length, count, s.k, key_panels, length, s.p);
+        for (int64_t g = 0; g < groups; g += GSF__ATT_QUERIES / group) {
+            const int64_t count = gsf__least(GSF__ATT_QUERIES / group, groups - g), r = g * group;
+            parts->logits(s.q + g * gsf__attention_slots(parts) * length, count, s.k, key_panels, length, s.p);
             const int64_t at = (head * d->queries + first + r) * d->keys + key; // into mask and bias
             const unsigned char* mask = d->mask ? d->mask + at : NULL;
             if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
-            parts->weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
-            parts->values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
+            parts->weights(s.p, count * group, columns, s.top + r, s.sum + 8 * r, fade);
+            parts->values(s.p, count, s.v, keys, job->panels, fade, s.out + g * height);
         }
     }
+    if (parts->leave) parts->leave();
     gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column, d->lse ? d->lse + head * d->queries + first : NULL);
 }
 
 #endif // GSF__X86
 
-static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, int pairs) { // pairs: bf16 operands
+// pairs: bf16 operands
+static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, int pairs, int32_t head_dim) {
 #if GSF__X86
     static const gsf__attention_parts avx2 = {
-        1, gsf__attention_pack_rows, gsf__attention_pack_values,
-        gsf__attention_logits_avx2,  gsf__attention_weights_avx2, gsf__attention_values_avx2};
+        1, GSF__ATT_GROUP, GSF__ATT_PANEL, NULL, NULL,
+        gsf__attention_pack_group, gsf__attention_pack_rows, gsf__attention_pack_values,
+        gsf__attention_logits_avx2, gsf__attention_weights_avx2, gsf__attention_values_avx2};
     static const gsf__attention_parts avx512 = {
-        1, gsf__attention_pack_rows, gsf__attention_pack_values,
+        1, GSF__ATT_GROUP, GSF__ATT_PANEL, NULL, NULL,
+        gsf__attention_pack_group, gsf__attention_pack_rows, gsf__attention_pack_values,
         gsf__attention_logits_avx512, gsf__attention_weights_avx512, gsf__attention_values_avx512};
     static const gsf__attention_parts bf16 = {
-        2, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
+        2, GSF__ATT_GROUP, GSF__ATT_PANEL, NULL, NULL,
+        gsf__attention_pack_group_bf16, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
         gsf__attention_logits_bf16, gsf__attention_weights_bf16, gsf__attention_values_bf16};
-    if (GSF__REACHES(level, AVX512_BF16) && pairs) return &bf16;
+#if GSF__AMX
+    static const gsf__attention_parts amx = {
+        2, GSF__AMX_ROWS, 2 * GSF__ATT_PANEL, gsf__enter_tiles, gsf__leave_tiles,
+        gsf__attention_pack_group_amx, gsf__attention_pack_pairs, gsf__attention_pack_values_amx,
+        gsf__attention_logits_amx, gsf__attention_weights_bf16, gsf__attention_values_amx};
+    if (GSF__REACHES(level, AMX) && pairs && head_dim % 32 == 0) return &amx;
+#endif
+    if (GSF__REACHES(level, AVX512_BF16) && pairs && head_dim % 2 == 0) return &bf16;
     if (GSF__REACHES(level, AVX512)) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
+    (void)head_dim;
     (void)pairs;
     (void)level;
     return NULL;
@@ -6099,7 +6396,7 @@ static size_t gsf__attention_plan(gsf__attention_job* job) {
     if (job->ranges < wanted) job->ranges = wanted < most ? wanted : most > job->ranges ? most : job->ranges;
     if (job->ranges < 1) return 0;
     const int64_t size = (d->queries - 1) / job->ranges + 1;
-    job->range_size = (size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP * GSF__ATT_GROUP;
+    job->range_size = gsf__round_up(size, job->parts ? job->parts->group : GSF__ATT_GROUP);
     job->ranges = (d->queries - 1) / job->range_size + 1; // rounding up may leave the last ones empty
     return (size_t)(d->heads * job->ranges);
 }
@@ -6123,14 +6420,13 @@ static size_t gsf__attention_floats(const gsf__attention_job* job) {
 // also reach queries for which that row is masked.
 static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
                                         const gsf__nn_attention_desc* desc) {
-    const int pairs = desc->bf16 && desc->head_dim % 2 == 0;
     gsf__nn_workspace own;
     gsf__attention_job job;
     size_t size;
     memset(&own, 0, sizeof own);
     memset(&job, 0, sizeof job);
     job.desc = *desc;
-    job.parts = gsf__attention_parts_of(ctx->cpu_level, pairs);
+    job.parts = gsf__attention_parts_of(ctx->cpu_level, desc->bf16 != 0, desc->head_dim);
     gsf__nn_attention_desc* d = &job.desc;
     if (!d->q || !d->k || !d->v || !d->out || d->queries < 0 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: a tensor or a size is missing");
@@ -19156,9 +19452,11 @@ typedef struct gsf__nn_linear_grad_desc {
     float* dx;                 // (rows, in) or NULL
     int32_t accumulate;        // dx += instead of dx = ...
     float *dweight, *dbias;    // (out, in), (out), added to; each may be NULL
+    int32_t bf16;              // GSF__NN_BF16_ALL: the operands of dx and dweight are rounded, see gsf__nn_linear_desc
 } gsf__nn_linear_grad_desc;
 
-// y = x w^T + b: dx = dy w, dw = dy^T x, db = the sum of dy's rows. `workspace` NULL: scratch is allocated for this call only.
+// y = x w^T + b: dx = dy w, dw = dy^T x, db = the sum of dy's rows. Up to 4 rows are not rounded to bf16.
+// `workspace` NULL: scratch is allocated for this call only.
 GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_linear_grad_desc* d) {
     gsf__nn_linear_desc multiply;
     int64_t in, out;
@@ -19171,11 +19469,13 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* 
     GSF__TRY(gsf__check_linear(ctx, &multiply, &in, &out));
     if (!d->dy) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: dy is missing");
     if (d->rows == 0) return GSF_OK;
+    const int32_t bf16 = d->rows > GSF__GEMV_ROWS ? d->bf16 : 0;
     if (d->dx) {
         multiply.x = d->dy;
         multiply.ldx = 0;
         multiply.transposed_weight = 1;
         multiply.accumulate = d->accumulate;
+        multiply.bf16 = bf16;
         GSF__TRY(gsf__nn_run_linear(ctx, workspace, &multiply));
     }
     if (d->dweight) {
@@ -19189,6 +19489,7 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* 
         multiply.transposed_weight = 1;
         multiply.ldw = d->ldx;
         multiply.accumulate = 1;
+        multiply.bf16 = bf16;
         multiply.y = d->dweight;
         GSF__TRY(gsf__nn_run_linear(ctx, workspace, &multiply));
     }
@@ -19200,11 +19501,12 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* 
 /* FlashAttention-2's backward pass (Dao 2023): per head and block of keys, blocks of queries recompute the weights from the
    logits and the forward pass's lse. With p = softmax(s), s the logits:
        dp = dy v^T    ds = p (dp - sum(p dp)) = p (dp - dy out^T)    dv += p^T dy    dq += scale ds k    dk += scale ds^T q
-   All five products are gsf__grad_product of blocks that stay in cache. A unit of work is one head. */
+   All five products are gsf__grad_product of blocks that stay in cache, with bf16 and AMX as tiles. A unit of work is one
+   head. */
 enum { GSF__ATT_GRAD_KEYS = 128, GSF__ATT_GRAD_QUERIES = 96 }; // per block; queries: a multiple of 6
 
 typedef struct gsf__nn_attention_grad_desc {
-    const gsf__nn_attention_desc* forward; // of the forward pass, with out and lse; without mask, bias and bf16
+    const gsf__nn_attention_desc* forward; // of the forward pass, with out and lse; without mask and bias
     const float* dy;        // (queries, heads*head_dim)
     float *dq, *dk, *dv;    // (queries or keys, heads*head_dim)
 } gsf__nn_attention_grad_desc;
@@ -19216,6 +19518,7 @@ typedef struct gsf__attention_grad_job {
     float* scratch;
     size_t scratch_floats;       // per worker
     int64_t pitch;               // of rows of head_dim values in scratch
+    int tiles;                   // products of bf16 by AMX
 } gsf__attention_grad_job;
 
 // Row stride of a block: an odd number of cache lines, so that the rows do not compete for the same cache sets.
@@ -19229,6 +19532,7 @@ typedef struct gsf__attention_grad_blocks { // of one worker
     float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart
     float *p, *dp;           // (queries, keys)
     float *center, *delta;   // (dim); (queries): dy out^T
+    float* packed;           // both operands of a product, with tiles
 } gsf__attention_grad_blocks;
 
 // Divides the memory of a worker; returns the floats needed.
@@ -19247,6 +19551,8 @@ static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, fl
     b->dp = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->center = gsf__nn_share(&arena, pitch);
     b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
+    const int64_t longest = gsf__round_up(job->desc.head_dim, 32) + GSF__ATT_GRAD_KEYS;
+    b->packed = gsf__nn_share(&arena, job->tiles ? (size_t)(longest * longest) : 0);
     return arena.used;
 }
 
@@ -19255,13 +19561,54 @@ static void gsf__attention_grad_copy(const float* from, int64_t ld, int64_t rows
     for (int64_t r = 0; r < rows; r++) memcpy(to + r * pitch, from + r * ld, (size_t)dim * sizeof(float));
 }
 
+#if GSF__AMX
+// A product by tiles of bf16: a_row or a_step is 1. Whole tiles of c are updated in place.
+GSF__TARGET_AMX static void gsf__multiply_amx(const gsf__grad_product* p, float* packed) {
+    const int64_t groups = gsf__ceil_div(p->rows, GSF__AMX_ROWS), panels = gsf__ceil_div(p->columns, 16);
+    const int64_t tiles = gsf__ceil_div(p->count, 32), size = tiles * GSF__AMX_TILE;
+    float* const b = packed + groups * size;
+    for (int64_t g = 0; g < groups; g++) {
+        const int64_t row = g * GSF__AMX_ROWS, rows = gsf__least(p->rows - row, GSF__AMX_ROWS);
+        if (p->a_step == 1) gsf__pack_rows_amx(p->a + row * p->a_row, p->a_row, rows, p->count, packed + g * size);
+        else gsf__pack_columns_amx(p->a + row, p->a_step, rows, p->count, packed + g * size);
+    }
+    for (int64_t j = 0; j < panels; j++)
+        gsf__pack_transposed_bf16((const char*)(p->b + 16 * j), GSF_NN_F32, (size_t)p->ldb * sizeof(float),
+                                  gsf__least(p->columns - 16 * j, 16), p->count, b + j * size);
+    for (int64_t g = 0; g < groups; g++)
+        for (int64_t j = 0; j < panels; j++) {
+            const int64_t row = g * GSF__AMX_ROWS, rows = gsf__least(p->rows - row, GSF__AMX_ROWS);
+            const int64_t columns = gsf__least(p->columns - 16 * j, 16);
+            const int whole = rows == GSF__AMX_ROWS && columns == 16;
+            const float *x = packed + g * size, *w = b + j * size;
+            float edge[GSF__AMX_TILE], *c = p->c + row * p->ldc + 16 * j, *to = whole ? c : edge;
+            const int64_t pitch = whole ? 4 * p->ldc : 64;
+            for (int64_t r = 0; !whole && r < rows; r++) memcpy(edge + 16 * r, c + r * p->ldc, (size_t)columns * sizeof *c);
+            GSF__AMX_FENCE
+            _tile_loadd(0, to, pitch);
+            for (int64_t k = 0; k < tiles; k++) {
+                _tile_loadd(4, x + k * GSF__AMX_TILE, 64);
+                _tile_loadd(6, w + k * GSF__AMX_TILE, 64);
+                _tile_dpbf16ps(0, 4, 6);
+            }
+            _tile_stored(0, to, pitch);
+            GSF__AMX_FENCE
+            for (int64_t r = 0; !whole && r < rows; r++) memcpy(c + r * p->ldc, edge + 16 * r, (size_t)columns * sizeof *c);
+        }
+}
+#endif
+
 // c = a b or, with `add`, c += a b
-static void gsf__attention_grad_multiply(const gsf__attention_grad_job* job, const float* a, int64_t a_row, int64_t a_step,
-                                         int64_t rows, const float* b, int64_t ldb, int64_t count, int64_t columns, float* c,
-                                         int64_t ldc, int add) {
+static void gsf__attention_grad_multiply(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* blocks,
+                                         const float* a, int64_t a_row, int64_t a_step, int64_t rows, const float* b,
+                                         int64_t ldb, int64_t count, int64_t columns, float* c, int64_t ldc, int add) {
     const gsf__grad_product product = {a, b, c, a_row, a_step, ldb, ldc, rows, columns, count};
     for (int64_t r = 0; r < rows && !add; r++) memset(c + r * ldc, 0, (size_t)columns * sizeof(float));
-    job->kernels->multiply(&product);
+#if GSF__AMX
+    if (job->tiles) gsf__multiply_amx(&product, blocks->packed);
+#endif
+    (void)blocks;
+    if (!job->tiles) job->kernels->multiply(&product);
 }
 
 // Queries `first` ... of a head against the block of `keys` keys.
@@ -19273,14 +19620,14 @@ static void gsf__attention_grad_block(const gsf__attention_grad_job* job, const 
     const float *lse = d->lse + head * d->queries + first, *delta = b->delta + first;
     gsf__attention_grad_copy(d->q + first * d->ldq + column, d->ldq, queries, dim, pitch, b->q);
     gsf__attention_grad_copy(job->grad->dy + first * width + column, width, queries, dim, pitch, b->dy);
-    gsf__attention_grad_multiply(job, b->q, pitch, 1, queries, b->k_across, across, dim, keys, b->p, across, 0);
-    gsf__attention_grad_multiply(job, b->dy, pitch, 1, queries, b->v_across, across, dim, keys, b->dp, across, 0);
+    gsf__attention_grad_multiply(job, b, b->q, pitch, 1, queries, b->k_across, across, dim, keys, b->p, across, 0);
+    gsf__attention_grad_multiply(job, b, b->dy, pitch, 1, queries, b->v_across, across, dim, keys, b->dp, across, 0);
     for (int64_t r = 0; r < queries; r++)
         job->kernels->attention(b->p + r * across, b->dp + r * across, keys, d->scale * 1.44269504f, d->scale, lse[r],
                                 delta[r]);
-    gsf__attention_grad_multiply(job, b->p, 1, across, keys, b->dy, pitch, queries, dim, b->dv, pitch, 1);
-    gsf__attention_grad_multiply(job, b->dp, 1, across, keys, b->q, pitch, queries, dim, b->dk, pitch, 1);
-    gsf__attention_grad_multiply(job, b->dp, across, 1, queries, b->k, pitch, keys, dim,
+    gsf__attention_grad_multiply(job, b, b->p, 1, across, keys, b->dy, pitch, queries, dim, b->dv, pitch, 1);
+    gsf__attention_grad_multiply(job, b, b->dp, 1, across, keys, b->q, pitch, queries, dim, b->dk, pitch, 1);
+    gsf__attention_grad_multiply(job, b, b->dp, across, 1, queries, b->k, pitch, keys, dim,
                                  job->grad->dq + first * width + column, width, 1);
 }
 
@@ -19290,6 +19637,9 @@ static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
     const int64_t dim = d->head_dim, width = d->heads * dim, head = (int64_t)index, column = head * dim;
     gsf__attention_grad_blocks b;
     gsf__attention_grad_lay_out(job, job->scratch + (size_t)worker * job->scratch_floats, &b);
+#if GSF__AMX
+    if (job->tiles) gsf__enter_tiles();
+#endif
     gsf__attention_center(d, column, b.center);
     for (int64_t r = 0; r < d->queries; r++) {
         const float *dy = job->grad->dy + r * width + column, *out = d->out + r * d->ldo + column;
@@ -19314,6 +19664,9 @@ static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
         gsf__attention_grad_copy(b.dk, job->pitch, keys, dim, width, job->grad->dk + key * width + column);
         gsf__attention_grad_copy(b.dv, job->pitch, keys, dim, width, job->grad->dv + key * width + column);
     }
+#if GSF__AMX
+    if (job->tiles) gsf__leave_tiles();
+#endif
 }
 
 GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_attention_grad_desc* desc) {
@@ -19330,6 +19683,7 @@ GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_at
     gsf__attention_fill_in(d);
     job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
     job.pitch = gsf__grad_pitch(d->head_dim);
+    job.tiles = GSF__AMX && d->bf16 && GSF__REACHES(ctx->cpu_level, AMX);
     job.scratch_floats = gsf__attention_grad_lay_out(&job, NULL, &blocks);
     if (!gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &count))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld queries", (long long)d->queries);
@@ -20253,6 +20607,7 @@ static gsf_result gsf__dit_lora_grad(gsf__dit_train* t, const gsf__lora_pair* p,
     down.rows = rows;
     down.weight = p->a;
     down.y = u;
+    down.bf16 = t->run.nn.bf16;
     gsf_result result = gsf__nn_run_linear(ctx, workspace, &down);
     for (int64_t i = 0; i < count; i++) u[i] *= p->scale;
     memset(&d, 0, sizeof d);
@@ -20261,6 +20616,7 @@ static gsf_result gsf__dit_lora_grad(gsf__dit_train* t, const gsf__lora_pair* p,
     d.weight = p->b;
     d.dy = dy;
     d.dx = du;
+    d.bf16 = t->run.nn.bf16;
     d.dweight = gsf__nn_grad_of(t->params, p->b);
     if (!result) result = gsf__nn_linear_grad(ctx, workspace, &d);
     for (int64_t i = 0; i < count; i++) du[i] *= p->scale;
@@ -20284,6 +20640,7 @@ static gsf_result gsf__dit_linear_grad(gsf__dit_train* t, const gsf__nn_layer* l
     d.dy = dy;
     d.dx = dx;
     d.accumulate = accumulate;
+    d.bf16 = t->run.nn.bf16;
     d.dweight = gsf__nn_grad_of(t->params, layer->weight);
     d.dbias = gsf__nn_grad_of(t->params, layer->bias);
     for (size_t i = 0; t->lora && i < t->lora->count; i++)
@@ -20339,6 +20696,7 @@ static gsf__nn_attention_desc gsf__dit_attention_of(const gsf__dit_run* run, int
     a.v = v;
     a.out = out;
     a.lse = lse;
+    a.bf16 = run->nn.bf16;
     return a;
 }
 
@@ -20635,7 +20993,6 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
 static gsf_result gsf__dit_check_training(gsf_context* ctx, const gsf_nn_transformer* c, const gsf__dit_train_desc* desc) {
     const gsf__dit_nets* nets = (const gsf__dit_nets*)c->nets;
     if (nets->quantized) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "training: the transformer has 8-bit layers");
-    if (c->bf16) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "training: bf16 products are not supported");
     for (int32_t b = 0; b < desc->batch; b++) {
         const gsf__dit_example* e = &desc->examples[b];
         if (!e->latents || !e->control || !e->noise || !e->text || e->timestep < 0 ||
@@ -20676,6 +21033,7 @@ GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_
         GSF__TRY(gsf__dit_check_input(ctx, c, &in));
         gsf__dit_begin_run(&t.run, ctx, c);
         gsf__dit_set_input(&t.run, &in);
+        t.run.nn.bf16 = c->bf16 ? GSF__NN_BF16_ALL : 0;
         float* memory = (float*)gsf_alloc(ctx, gsf__dit_lay_out_train(&t, NULL), sizeof(float));
         if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
         gsf__dit_lay_out_train(&t, memory);

@@ -2,10 +2,12 @@
 // compiles it. By hand: cc -O2 -std=c11 -fopenmp -I. bench/train_block.c -o train_block -lm
 //
 //     train_block MODEL OUT.safetensors [--frames 5] [--height 4] [--width 166] [--references 1850] [--runs 3] [--threads 1]
+//         [--bf16 0]
 //
-// MODEL: made by make_model --size full --layers 1 --parts transformer. Runs its first block in float32 on normal noise, with
-// 226 tokens of text and frames * height * width / 4 of video, and prints the CPU seconds of each run. OUT gets what went in
-// and what came out: x, references, time, cos, sin, dy; dx, dreferences, dtime and the gradients of the block's weights.
+// MODEL: made by make_model --size full --layers 1 --parts transformer. Runs its first block in float32, or with products of
+// bf16, on normal noise, with 226 tokens of text and frames * height * width / 4 of video, and prints the CPU seconds of each
+// run. OUT gets what went in and what came out: x, references, time, cos, sin, dy; dx, dreferences, dtime and the gradients of
+// the block's weights.
 #define GSF_NN_TRAINING
 #define GSFIXER_IMPLEMENTATION
 #ifndef GSFIXER_STATIC
@@ -24,6 +26,7 @@ typedef struct block_run {
     gsf_nn_transformer_desc in;
     float *memory, *x, *dy;
     double timestep;
+    int bf16;
 } block_run;
 
 static int trains(const char* name) { return strncmp(name, "transformer_blocks.0.", 21) == 0; }
@@ -50,6 +53,7 @@ static gsf_result open_run(block_run* r, const char* model, const int64_t size[4
     r->in.references = r->params.value; // until there is memory
     gsf__dit_begin_run(&r->t.run, ctx, &r->net);
     gsf__dit_set_input(&r->t.run, &r->in);
+    r->t.run.nn.bf16 = r->bf16 ? GSF__NN_BF16_ALL : 0;
     r->t.params = &r->params;
     r->memory = (float*)gsf_alloc(ctx, gsf__dit_lay_out_train(&r->t, NULL), sizeof(float));
     if (!r->memory) return GSF_ERROR_OUT_OF_MEMORY;
@@ -106,21 +110,23 @@ static gsf_result save_run(block_run* r, const char* path) {
 
 int main(int argc, char** argv) {
     static block_run r;
-    static const char* const names[] = {"--frames", "--height", "--width", "--references", "--runs", "--threads"};
-    int64_t values[6] = {5, 4, 166, 1850, 3, 1};
+    static const char* const names[] = {"--frames", "--height", "--width", "--references", "--runs", "--threads", "--bf16"};
+    int64_t values[7] = {5, 4, 166, 1850, 3, 1, 0};
     int bad = argc < 3;
     for (int i = 3; i < argc; i += 2) {
         int known = 0;
-        for (int k = 0; k < 6 && i + 1 < argc; k++)
+        for (int k = 0; k < 7 && i + 1 < argc; k++)
             if (strcmp(argv[i], names[k]) == 0) values[k] = atoi(argv[i + 1]), known = 1;
         bad |= !known;
     }
     for (int k = 0; k < 6; k++) bad |= values[k] < 1;
     if (bad) {
-        fprintf(stderr, "usage: train_block MODEL OUT [--frames F] [--height H] [--width W] [--references R] [--runs N]\n");
+        fprintf(stderr, "usage: train_block MODEL OUT [--frames F] [--height H] [--width W] [--references R] [--runs N] "
+                        "[--threads T] [--bf16 1]\n");
         return 2;
     }
     r.ctx.threads = (int32_t)values[5];
+    r.bf16 = values[6] != 0;
     gsf_result result = gsf_init_context(&r.ctx);
     if (result == GSF_OK) result = open_run(&r, argv[1], values);
     for (int64_t i = 0; i < values[4] && result == GSF_OK; i++) {

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """A block of the paper's transformer, forwards and backwards, beside the same block in PyTorch, on one core.
 
-    bench/train_block_peer.py --make-model build/make_model --out DIR [--runs 3] [--cc cc]
+    bench/train_block_peer.py --make-model build/make_model --out DIR [--bf16] [--runs 3] [--cc cc]
 
 Compiles bench/train_block.c, makes one block of the release's size (3072 wide, 48 heads of 64) with random weights in DIR/model
 unless it is there, and runs it on 1,056 tokens with 1,850 reference tokens, all in f32: the output, and the gradients of the
 input, the references, the time embedding and all weights. Both take turns; the fastest of --runs counts, in CPU time. PyTorch
 runs its layers (MKL) and the same ones with the weights packed by oneDNN where that serves gradients, and keeps its
-intermediates. That both blocks are the same is shown by the largest relative error (L2) of the gradients, computed here from
+intermediates. With --bf16, ours rounds the operands of its products to bfloat16; PyTorch does so by autocast and, in another
+turn, has all weights, activations and gradients in bfloat16. That both blocks are the same is shown by the largest relative error (L2) of the gradients, computed here from
 PyTorch's. Needs numpy and torch (its CPU build is enough).
 """
 import argparse
@@ -41,11 +42,11 @@ def tensors_of(path):
 
 
 class Block:
-    def __init__(self, model, run):
+    def __init__(self, model, run, dtype=torch.float32):
         before = "transformer_blocks.0."
         files = os.path.join(model, "transformer", "diffusion_pytorch_model.safetensors")
-        self.p = {n[len(before):]: t.requires_grad_() for n, t in tensors_of(files).items() if n.startswith(before)}
-        self.cos, self.sin = run["cos"], run["sin"]
+        self.p = {n[len(before):]: t.to(dtype).requires_grad_() for n, t in tensors_of(files).items() if n.startswith(before)}
+        self.cos, self.sin = run["cos"].to(dtype), run["sin"].to(dtype)
         self.text = len(run["x"]) - len(self.cos)
 
     def linear(self, name, x):
@@ -92,19 +93,28 @@ class Block:
         return self.gated(x, y, text_gate, video_gate)
 
 
-def step(block, run):
-    inputs = [run[n].clone().requires_grad_() for n in ("x", "references", "time")]
+def step(block, run, autocast=False):
+    dtype = block.p["attn1.to_q.weight"].dtype
+    inputs = [run[n].to(dtype, copy=True).requires_grad_() for n in ("x", "references", "time")]
+    dy = run["dy"].to(dtype)
     for p in block.p.values():
         p.grad = None
     begin = time.process_time()
-    block(*inputs).backward(run["dy"])
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        y = block(*inputs)
+    y.backward(dy.to(y.dtype))
     return time.process_time() - begin, inputs
+
+
+def median(errors):
+    return sorted(errors.values())[len(errors) // 2]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--make-model", required=True)
     parser.add_argument("--out", required=True)
+    parser.add_argument("--bf16", action="store_true")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--cc", default="cc")
     o = parser.parse_args()
@@ -118,16 +128,26 @@ def main():
         subprocess.check_call([o.make_model, model, "--size", "full", "--layers", "1", "--parts", "transformer"])
     file = os.path.join(o.out, "run.safetensors")
     ours, theirs, block = [], {"MKL": [], "oneDNN": []}, None
+    if o.bf16:
+        theirs = {"autocast": [], "all bf16": []}
     for _ in range(o.runs):
-        out = subprocess.check_output([program, model, file, "--runs", "2", "--threads", "1"], text=True)
-        ours.append(float(out.splitlines()[-1].split()[2])) # the first touches memory for the first time
+        # the first run touches memory for the first time
+        out = subprocess.check_output([program, model, file, "--runs", "2", "--threads", "1", "--bf16", str(int(o.bf16))],
+                                      text=True)
+        ours.append(float(out.splitlines()[-1].split()[2]))
         run = tensors_of(file)
         if block is None:
             block = Block(model, run)
+            rounded = Block(model, run, torch.bfloat16) if o.bf16 else None
         for name in theirs:
-            with torch.backends.mkldnn.flags(enabled=name == "oneDNN"):
-                seconds, inputs = step(block, run)
+            with torch.backends.mkldnn.flags(enabled=name != "MKL"):
+                seconds, inputs = step(rounded if name == "all bf16" else block, run, name == "autocast")
             theirs[name].append(seconds)
+    if o.bf16:  # what both are compared to
+        rounded_grads = {n: p.grad.float() for n, p in rounded.p.items()}
+        inputs = step(block, run)[1]
+        by_torch = {n: float((g - block.p[n].grad).norm() / block.p[n].grad.norm()) for n, g in rounded_grads.items()
+                    if "norm_k.bias" not in n}
     errors = {n: float((g - run["d" + n]).norm() / g.norm())
               for n, g in zip(("x", "references", "time"), (t.grad for t in inputs))}
     for name, p in block.p.items():
@@ -136,6 +156,10 @@ def main():
     worst = max(errors, key=errors.get)
     print(f"{len(run['x'])} tokens, {len(run['references'])} reference tokens; PyTorch {torch.__version__}")
     print(f"largest relative error of {len(errors)} gradients: {errors[worst]:.1e} ({worst})")
+    if o.bf16:
+        worst = max(by_torch, key=by_torch.get)
+        print(f"that of PyTorch all in bf16: {by_torch[worst]:.1e} ({worst}); medians {median(errors):.1e}, "
+              f"PyTorch {median(by_torch):.1e}")
     print(f"gsfixer  {min(ours):.2f} CPU s  {['%.2f' % s for s in ours]}")
     for name, seconds in theirs.items():
         print(f"PyTorch {name}  {min(seconds):.2f} CPU s  {['%.2f' % s for s in seconds]}")

@@ -106,7 +106,7 @@ static const option_spec option_specs[] = {
      "dit: quantize most layers of the transformer to 8-bit integers; needs one byte of memory per weight"},
     {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore evaluate",
      "dit: matrix products of the transformer in bfloat16 where the processor has instructions that make them faster\n"
-     "(AVX512_BF16, but not Intel's); implied by --quality fast"},
+     "(AMX, or AVX512_BF16, but not Intel's); implied by --quality fast"},
     {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore evaluate",
      "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"
      "has never seen, then replace its learned positions"},
@@ -289,7 +289,7 @@ static void print_version(void) {
 #if defined(GSF_NO_SIMD)
     printf("instruction sets  scalar\n");
 #elif defined(__x86_64__) || defined(_M_X64)
-    printf("instruction sets  scalar, avx2, avx512, avx512_vnni, avx512_bf16; chosen by the processor at start\n");
+    printf("instruction sets  scalar, avx2, avx512, avx512_vnni, avx512_bf16, amx; chosen by the processor at start\n");
 #elif defined(__aarch64__) || defined(__wasm_simd128__)
     printf("instruction sets  scalar, simd128\n");
 #else

@@ -4,7 +4,7 @@
        train_restorer OUT --model MODEL_DIR --data DATASET [--lora RANK [--alpha RANK] [--targets to_q,to_k,to_v,to_out.0]]
            [--iterations 10000] [--batch 8] [--groups 8] [--rate 2e-5] [--warmup 500] [--cosine] [--weight-decay 0.01]
            [--clip 1] [--average 0] [--drop-references 0.1] [--drop-prompt 0.1] [--seed 0] [--save-every 100] [--cache DIR]
-           [--caption TEXT] [--threads N] [--resume] [--memory]
+           [--caption TEXT] [--threads N] [--bf16] [--resume] [--memory]
 
    MODEL_DIR: as for gsfix fix --restorer dit:MODEL_DIR; DATASET: the DIR of gsfix dataset. Each sequence is encoded once, by
    the code that encodes clips for the restorer, to a file in OUT/cache: frames and photos (VAE), references (DINOv2, VGGT),
@@ -21,6 +21,8 @@
    is what --resume continues from, written every --save-every steps; a run that was killed and resumed ends with the same
    bytes, as do runs with other numbers of threads. Delete OUT/cache if the weights of MODEL_DIR's encoders change.
    OUT/training.loss.html shows the loss.
+   --bf16: products of bfloat16, where the processor has them fast (AMX; AVX-512 of AMD since Zen 4): operands are rounded to
+   bfloat16, sums, weights, gradients and everything else stay float32, as does the memory needed.
    --memory: only print what training needs. With -DGSF_USE_MPI, compiled by mpicc, up to --groups ranks share each batch:
        mpirun -np 2 train_restorer ...
    writes the bytes of one rank (training.h). OUT is then on storage that all of them see. */
@@ -45,7 +47,7 @@
 
 typedef struct options {
     const char *out, *model, *data, *cache, *caption, *targets;
-    int lora, iterations, batch, groups, warmup, cosine, save_every, threads, resume, memory;
+    int lora, iterations, batch, groups, warmup, cosine, save_every, threads, bf16, resume, memory;
     double rate, alpha, decay, clip, average, drop_references, drop_prompt;
     uint64_t seed;
 } options;
@@ -464,8 +466,8 @@ static gsf_result meet_settings(training* t) {
                     o->lora ? o->targets : "", o->batch, o->groups, o->rate, o->warmup);
     gsf_append_text(&t->ctx, &text, "\"cosine\": %d, \"weight_decay\": %.17g, \"clip\": %.17g, \"average\": %.17g, ",
                     o->cosine ? o->iterations : 0, o->decay, o->clip, o->average);
-    gsf_append_text(&t->ctx, &text, "\"drop_references\": %.17g, \"drop_prompt\": %.17g, \"seed\": \"%llu\"}\n",
-                    o->drop_references, o->drop_prompt, (unsigned long long)o->seed);
+    gsf_append_text(&t->ctx, &text, "\"drop_references\": %.17g, \"drop_prompt\": %.17g, \"seed\": \"%llu\"%s}\n",
+                    o->drop_references, o->drop_prompt, (unsigned long long)o->seed, o->bf16 ? ", \"bf16\": 1" : "");
     gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
     const int has_state = is_there(join(o->out, "training.state").text);
     if (result == GSF_OK && has_state && !o->resume)
@@ -783,7 +785,7 @@ static int usage(FILE* to) {
             "       [--lora RANK [--alpha RANK] [--targets to_q,to_k,to_v,to_out.0]]\n"
             "       [--iterations 10000] [--batch 8] [--groups 8] [--rate 2e-5] [--warmup 500] [--cosine]\n"
             "       [--weight-decay 0.01] [--clip 1] [--average 0] [--drop-references 0.1] [--drop-prompt 0.1]\n"
-            "       [--seed 0] [--save-every 100] [--cache DIR] [--caption TEXT] [--threads N] [--resume] [--memory]\n"
+            "       [--seed 0] [--save-every 100] [--cache DIR] [--caption TEXT] [--threads N] [--bf16] [--resume] [--memory]\n"
             "Trains the transformer of the restorer dit, or adapters for it, on the sequences of gsfix dataset.\n");
     return to == stdout ? 0 : 2;
 }
@@ -794,6 +796,7 @@ static int parse_options(int argc, char** argv, options* o) {
         if (strcmp(name, "--resume") == 0) o->resume = 1;
         else if (strcmp(name, "--memory") == 0) o->memory = 1;
         else if (strcmp(name, "--cosine") == 0) o->cosine = 1;
+        else if (strcmp(name, "--bf16") == 0) o->bf16 = 1;
         else if (name[0] != '-') {
             if (o->out) return 0;
             o->out = name;

@@ -58,7 +58,7 @@ static inline void test_context_zero(gsf_context* ctx) {
 static inline void test_context_init(gsf_context* ctx) {
     test_context_zero(ctx);
 #if GSF__X86
-    if (ctx->cpu_level == GSF_CPU_AUTO) ctx->cpu_level = GSF_CPU_AVX512_BF16;
+    if (ctx->cpu_level == GSF_CPU_AUTO) ctx->cpu_level = GSF_CPU_AMX;
 #endif
     if (gsf_init_context(ctx) != GSF_OK) { fprintf(stderr, "gsf_init_context: %s\n", ctx->error); exit(2); }
 }

@@ -59,21 +59,24 @@ static void log_line(void* user, gsf_log_level level, const char* text) {
     if (level == GSF_LOG_ERROR) snprintf((char*)user, 64, "%.63s", text);
 }
 
-// AUTO selects the machine's highest level, except for bfloat16 dot products that are slower than float32; Intel's are.
+// AUTO selects the machine's highest level, except for bfloat16 dot products that are slower than float32; Intel's are, without
+// tiles.
 static void test_auto_level(gsf_cpu_level selected) {
     gsf_context ctx;
     char line[4096];
-    int intel = 0, bf16 = 0;
+    int intel = 0, bf16 = 0, tiles = 0;
     FILE* file = fopen("/proc/cpuinfo", "r");
     while (file && fgets(line, sizeof line, file)) {
         intel |= strstr(line, "GenuineIntel") != NULL;
         bf16 |= strstr(line, " avx512_bf16") != NULL;
+        tiles |= strstr(line, " amx_bf16") != NULL;
     }
     if (file) fclose(file);
     memset(&ctx, 0, sizeof ctx);
-    ctx.cpu_level = GSF_CPU_AVX512_BF16;
+    ctx.cpu_level = GSF_CPU_AMX;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    if (ctx.cpu_level != GSF_CPU_AVX512_BF16) CHECK(selected == ctx.cpu_level || selected == GSF_CPU_SIMD128);
+    if (ctx.cpu_level == GSF_CPU_AMX) CHECK(selected == ctx.cpu_level && tiles);
+    else if (ctx.cpu_level != GSF_CPU_AVX512_BF16) CHECK(selected == ctx.cpu_level || selected == GSF_CPU_SIMD128);
     else if (bf16) CHECK(selected == (intel ? GSF_CPU_AVX512_VNNI : GSF_CPU_AVX512_BF16));
 }
 

@@ -411,7 +411,9 @@ static void check_attention(void) {
         {6, 16, 1, 8, 0, 0, -1, 1, 0},   {49, 513, 2, 72, 1, 0, 0, 1, 0}, {50, 257, 3, 40, 5, 0, 0.3f, 1, 0},
         {803, 70, 3, 16, 0, 0, 0, 1, 0}, {30, 33, 2, 24, 2, 1, 0, 1, 0},  {9, 600, 1, 20, 0, 1, 0, 1, 0},
         {5, 700, 1, 64, 0, 0, 0, 30, 0}, {1541, 20, 1, 4, 0, 0, 0, 1, 0}, {48, 256, 1, 128, 0, 0, 0, 1, 0},
-        {57, 300, 2, 24, 1, 0, 1, 1, 3}, {9, 270, 3, 20, 0, 1, 0, 1, 2},  {803, 33, 2, 8, 0, 0, 0, 1, 9}};
+        {57, 300, 2, 24, 1, 0, 1, 1, 3}, {9, 270, 3, 20, 0, 1, 0, 1, 2},  {803, 33, 2, 8, 0, 0, 0, 1, 9},
+        {50, 257, 3, 96, 5, 0, 0.3f, 1, 0}, {77, 300, 2, 32, 1, 0, 1, 1, 3}, {30, 271, 2, 64, 2, 1, 0, 1, 0},
+        {803, 31, 2, 32, 0, 0, 0, 1, 9}};
     for (size_t n = 0; n < 2 * GSF__COUNT(cases); n++) {
         const attention_case* c = &cases[n / 2];
         const size_t values = (size_t)(c->queries * c->heads * c->dim);
@@ -572,7 +574,7 @@ static void check_attention_errors(void) {
 }
 
 int main(void) {
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AMX; level++) {
         if (!open_contexts((gsf_cpu_level)level)) continue;
 #if GSF__X86
         if (level >= GSF_CPU_AVX2) check_exp();

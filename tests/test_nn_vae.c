@@ -131,7 +131,7 @@ static void test_convolve(void) {
     };
     gsf_context ctx;
     uint64_t seed = 1;
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AMX; level++) {
         test_context_zero(&ctx);
         ctx.cpu_level = (gsf_cpu_level)level;
         CHECK_OK(&ctx, gsf_init_context(&ctx));
@@ -213,7 +213,7 @@ static void test_maps(void) {
     };
     gsf_context ctx, other;
     uint64_t seed = 3;
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AMX; level++) {
         test_context_zero(&ctx);
         ctx.cpu_level = (gsf_cpu_level)level;
         other = ctx;

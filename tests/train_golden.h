@@ -372,7 +372,7 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
 static inline void train_golden_checks(void) {
     const test_names adam = test_list_golden("splat", "adam_", ".safetensors");
     const test_names densify = test_list_golden("splat", "densify_", ".safetensors");
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AMX; level++) {
         gsf_context ctx;
         memset(&ctx, 0, sizeof ctx);
         ctx.cpu_level = (gsf_cpu_level)level;
