@@ -756,9 +756,9 @@ typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
 } gsf_quality;
 
 // The loop's settings for few photos: 1200 iterations, regularisers (train.depth_smoothness; dropout and opacity_decay, which
-// are twice as strong for up to 3 photos as for 6 or more, in between in inverse proportion to view_count), the settings of
-// `quality`, and from the scene (NULL = none) the near plane for all its cameras and the points that determine the axes of
-// the path, which are borrowed.
+// are twice as strong for up to 3 photos as for 6 or more, in between in inverse proportion to view_count), train.lr_scales
+// (its default for up to 6 photos, twice that for 9 or more, in between linear), the settings of `quality`, and from the scene
+// (NULL = none) the near plane for all its cameras and the points that determine the axes of the path, which are borrowed.
 GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, size_t view_count, gsf_quality quality);
 
 // Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Use
@@ -15305,11 +15305,13 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 
 GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, size_t view_count, gsf_quality quality) {
     const float strength = view_count <= 3 ? 2.0f : view_count < 6 ? 6.0f / (float)view_count : 1.0f;
+    const float growth = view_count <= 6 ? 0.0f : view_count < 9 ? ((float)view_count - 6.0f) / 3.0f : 1.0f;
     gsf_fix_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.train.iterations = 1200;
     desc.train.dropout = 0.1f * strength;
     desc.train.opacity_decay = 0.002f * strength;
+    desc.train.lr_scales = 0.005f * (1.0f + growth); // faster, large splats in wrong places would explain fewer photos
     desc.train.depth_smoothness = 0.5f;
     desc.train.background_kind = GSF_BACKGROUND_PHOTOS;
     desc.train.lazy_adam = quality == GSF_QUALITY_FAST;

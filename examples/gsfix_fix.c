@@ -148,13 +148,14 @@ static int wants_also(const gsfix_app* app, int format) {
 
 static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
-#define BY_VIEWS (-1.0f) // no value of --set: what gsf_splat_resolve_few_view_desc takes for the number of photos
+#define BY_VIEWS (-2.0f) // no value of --set: what gsf_splat_resolve_few_view_desc takes for the number of photos
 #define BY_START (-2)    // no value of --set: longer for a start of few points, which have more to grow
 
 void gsfix_settle_train(gsf_train_desc* train, gsf_initial_kind start, size_t view_count) {
     const gsf_train_desc few = gsf_splat_resolve_few_view_desc(NULL, view_count, GSF_QUALITY_BALANCED).train;
     if (train->dropout == BY_VIEWS) train->dropout = few.dropout;
     if (train->opacity_decay == BY_VIEWS) train->opacity_decay = few.opacity_decay;
+    if (train->lr_scales == BY_VIEWS) train->lr_scales = few.lr_scales;
     if (train->densify_until == BY_START)
         train->densify_until = start == GSF_INITIAL_TRACKS && !train->mcmc ? 2 * train->iterations / 3 : 0;
 }
@@ -166,13 +167,15 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     setup->initial.seed = app->o.seed;
     setup->initial.sh_degree = 3;
     gsf_train_desc* train = &setup->fix.train;
-    train->dropout = train->opacity_decay = BY_VIEWS;
+    train->dropout = train->opacity_decay = train->lr_scales = BY_VIEWS;
     if (app->o.iterations) train->iterations = app->o.iterations;
     train->seed = app->o.seed;
     const int regularized = !app->o.regularize || strcmp(app->o.regularize, "off") != 0;
     if (regularized) train->densify_until = BY_START;
-    else
+    else {
         train->dropout = train->opacity_decay = train->scale_penalty = train->opacity_penalty = train->depth_smoothness = 0.0f;
+        train->lr_scales = 0.0f;
+    }
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     int code = apply_settings(app, setup);
     const char* background = app->o.background ? app->o.background : regularized ? "photos" : "black";

@@ -194,6 +194,10 @@ static void test_settings(gsf_context* ctx, host* h) {
     const gsf_fix_desc four = gsf_splat_resolve_few_view_desc(NULL, 4, GSF_QUALITY_BALANCED);
     CHECK(three.train.dropout == 0.2f && three.train.opacity_decay == 0.004f);
     CHECK(four.train.dropout == 0.1f * 1.5f && four.train.opacity_decay == 0.002f * 1.5f);
+    CHECK(three.train.lr_scales == 0.005f && alone.train.lr_scales == 0.005f);
+    CHECK_NEAR(gsf_splat_resolve_few_view_desc(NULL, 8, GSF_QUALITY_BALANCED).train.lr_scales, 0.005 * 5.0 / 3.0, 1e-8);
+    CHECK(gsf_splat_resolve_few_view_desc(NULL, 9, GSF_QUALITY_BALANCED).train.lr_scales == 0.01f);
+    CHECK(gsf_splat_resolve_few_view_desc(NULL, 50, GSF_QUALITY_BALANCED).train.lr_scales == 0.01f);
     CHECK(alone.train.iterations == 1200 && alone.train.dropout == 0.1f && alone.train.opacity_decay == 0.002f);
     CHECK(alone.train.depth_smoothness == 0.5f && alone.skip_psnr == 45.0f && !alone.train.lazy_adam);
     CHECK(alone.train.background_kind == GSF_BACKGROUND_PHOTOS);
