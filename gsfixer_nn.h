@@ -3795,6 +3795,8 @@ enum {
     GSF__GEMV_STEP = 1024             // values of four rows of x that are processed at a time
 };
 
+#define GSF__LINEAR_BLOCK GSF__LINEAR_DEPTH, GSF__LINEAR_ROWS, GSF__LINEAR_COLUMNS
+
 #ifndef GSF__LINEAR_PACKED // a test lowers it
 #define GSF__LINEAR_PACKED ((int64_t)1 << 24) // maximum number of packed weights (floats) in memory at a time: 64 MiB
 #endif
@@ -3826,6 +3828,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set; `count`: va
     int64_t unit;      // values per packed float: 1, or 2 in bf16; counts of packed values are in units
     int64_t height;    // rows of a group: 6 or, as tiles, 16
     int64_t step;      // packed values come in multiples of this, filled up with zeros
+    int64_t depth, rows, columns; // of a block, at most
     void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__linear_kernels;
 
@@ -3951,7 +3954,7 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 
 static const gsf__linear_kernels gsf__linear_scalar = {
     gsf__pack_weights_scalar, gsf__pack_transposed_scalar, gsf__pack_rows_scalar, gsf__pack_columns_scalar,
-    gsf__tile_scalar, NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1, GSF__TILE_ROWS, 1, NULL, NULL};
+    gsf__tile_scalar, NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, NULL, NULL};
 
 // ---- linear: where kernels are compiled for the instruction sets
 // Those of all sections written in the vector vocabulary, except the gradients' of >>nn training: one inclusion for all, as
@@ -4270,7 +4273,7 @@ GSF__TARGET_AVX2 static void gsf__gemv_avx2(const gsf__linear_job* job, int64_t 
 
 static const gsf__linear_kernels gsf__linear_avx2 = {
     gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
-    gsf__tile_avx2, NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1, GSF__TILE_ROWS, 1, NULL, NULL};
+    gsf__tile_avx2, NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, NULL, NULL};
 
 // ---- linear: AVX-512 kernels
 
@@ -4477,7 +4480,8 @@ GSF__TARGET_AVX512 static void gsf__gemv_avx512(const gsf__linear_job* job, int6
 
 static const gsf__linear_kernels gsf__linear_avx512 = {
     gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
-    gsf__tile_avx2, gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1, GSF__TILE_ROWS, 1, NULL, NULL};
+    gsf__tile_avx2, gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1, GSF__TILE_ROWS, 1,
+    GSF__LINEAR_BLOCK, NULL, NULL};
 
 // ---- linear: kernels for pairs of bf16
 
@@ -4594,7 +4598,7 @@ GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b
 
 static const gsf__linear_kernels gsf__linear_bf16 = {
     gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_bf16, gsf__pack_columns_bf16, gsf__tile_bf16,
-    gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__TILE_ROWS, 16, NULL, NULL};
+    gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__TILE_ROWS, 16, GSF__LINEAR_BLOCK, NULL, NULL};
 
 #endif // GSF__X86
 
@@ -4641,8 +4645,7 @@ GSF__TARGET_BF16 static void gsf__pack_columns_amx(const float* x, int64_t ldx, 
 
 GSF__TARGET_AMX static void gsf__tile_amx(const float* a, const float* b, int64_t count, int add, float* sums,
                                           const float* ahead, int64_t ahead_count) {
-    (void)ahead; // the processor loads the tiles early enough
-    (void)ahead_count;
+    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
     GSF__AMX_FENCE
     if (add) _tile_loadd(0, sums, 64);
     else _tile_zero(0);
@@ -4659,8 +4662,7 @@ GSF__TARGET_AMX static void gsf__four_tiles_amx(const float* a, const float* b, 
                                                 int64_t next, const float* ahead, int64_t ahead_count) {
     const int64_t across = GSF__AMX_ROWS * count;
     float* right = sums + next;
-    (void)ahead; // as above
-    (void)ahead_count;
+    const int64_t share = gsf__round_up(gsf__ceil_div(ahead_count, count / 16), 16); // per step
     GSF__AMX_FENCE
     if (add) {
         _tile_loadd(0, sums, 64);
@@ -4682,6 +4684,8 @@ GSF__TARGET_AMX static void gsf__four_tiles_amx(const float* a, const float* b, 
         _tile_loadd(5, a + across, 64);
         _tile_dpbf16ps(2, 5, 6);
         _tile_dpbf16ps(3, 5, 7);
+        for (int64_t i = 0; i < share; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
+        ahead += share;
     }
     _tile_stored(0, sums, 64);
     _tile_stored(1, right, 64);
@@ -4692,8 +4696,9 @@ GSF__TARGET_AMX static void gsf__four_tiles_amx(const float* a, const float* b, 
 
 static const gsf__linear_kernels gsf__linear_amx = {
     gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_amx, gsf__pack_columns_amx, gsf__tile_amx,
-    gsf__four_tiles_amx, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__AMX_ROWS, 16, gsf__enter_tiles,
-    gsf__leave_tiles};
+    gsf__four_tiles_amx, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__AMX_ROWS, 16,
+    128, 288, 1024, // a step of two groups and two panels fits the L1 cache, the sums of a block the L2 cache
+    gsf__enter_tiles, gsf__leave_tiles};
 
 #endif
 
@@ -4845,12 +4850,11 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
         shared = (size_t)gsf__round_up(in, GSF__GEMV_PAD) * GSF__GEMV_ROWS;
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
-        plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, kernels->step > 8 ? kernels->step : 8);
-        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : GSF__LINEAR_ROWS, 2 * kernels->height);
+        plan->depth = gsf__even_piece(in, kernels->depth, kernels->step > 8 ? kernels->step : 8);
+        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : kernels->rows, 2 * kernels->height);
         plan->row_blocks = gsf__ceil_div(rows, plan->block_rows);
         const int64_t most = GSF__LINEAR_PACKED / in / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
-        const int64_t more = kernels->enter ? 2 : 1; // tiles are fast compared to packing the rows for each block
-        const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : more * GSF__LINEAR_COLUMNS;
+        const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : kernels->columns;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
