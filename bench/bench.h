@@ -14,7 +14,7 @@ typedef struct bench_row {
     double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
-enum { BENCH_LEVELS = GSF_CPU_AVX512_BF16 + 1 };
+enum { BENCH_LEVELS = GSF_CPU_SIMD128 + 1 };
 static void bench_print(int json, const bench_row* row);
 
 // Measured peaks per second, by instruction set and threads (1, 2): float32 multiply-adds, integer and bf16 dot products.

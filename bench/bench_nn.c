@@ -122,6 +122,23 @@ GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int32_t wor
 }
 #endif
 
+#if GSF__AMX
+GSF__TARGET_AMX static void bench_dot_amx(void* arg, size_t chunk, int32_t worker) { // products of tiles that are loaded once
+    memset((float*)arg + 16 * chunk, 0, 16 * sizeof(float));
+    (void)worker;
+    gsf__enter_tiles();
+    _tile_zero(4);
+    _tile_zero(5);
+    for (int i = 0; i < FMA_ROUNDS / 16; i++) {
+        _tile_dpbf16ps(0, 4, 5);
+        _tile_dpbf16ps(1, 4, 5);
+        _tile_dpbf16ps(2, 4, 5);
+        _tile_dpbf16ps(3, 4, 5);
+    }
+    gsf__leave_tiles();
+}
+#endif
+
 static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* ops) { // ops: per step; NULL: no instructions for it
 #if GSF__X86
     *ops = level >= GSF_CPU_AVX512_VNNI ? 128.0 : level >= GSF_CPU_AVX512 ? 64.0 : 32.0;
@@ -143,8 +160,12 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     peak->flops = bench_peak_rate(o->json, &ctx, "machine: multiply-add", fma, work, "flop");
     const gsf_chunk_fn dot = bench_dot_of(level, &work);
     if (dot) peak->ops = bench_peak_rate(o->json, &ctx, "machine: integer dot products", dot, work, "op");
+#if GSF__AMX // a step of the rate is ten steps of FMA_ROUNDS; here, four tiles in a sixteenth of them
+    if (level == GSF_CPU_AMX)
+        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 tiles", bench_dot_amx, 16384.0 * 4 / 16 / 10, "flop");
+#endif
 #if GSF__X86
-    if (level >= GSF_CPU_AVX512_BF16)
+    if (level == GSF_CPU_AVX512_BF16)
         peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 dot products", bench_dot_bf16, 64.0, "flop");
 #endif
 }
@@ -1753,7 +1774,7 @@ int main(int argc, char** argv) {
         }
     }
     gsf_context ctx;
-    (void)bench_context(&ctx, GSF_CPU_AVX512_BF16, 1); // lowered to the machine's highest
+    (void)bench_context(&ctx, GSF_CPU_AMX, 1); // lowered to the machine's highest
     bench_best_level = ctx.cpu_level;
     (void)bench_context(&ctx, o.level ? o.level : bench_best_level, 1);
     o.level = ctx.cpu_level; // limited to what the machine supports
