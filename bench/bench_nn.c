@@ -162,7 +162,7 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     if (dot) peak->ops = bench_peak_rate(o->json, &ctx, "machine: integer dot products", dot, work, "op");
 #if GSF__AMX // a step of the rate is ten steps of FMA_ROUNDS; here, four tiles in a sixteenth of them
     if (level == GSF_CPU_AMX)
-        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 tiles", bench_dot_amx, 16384.0 * 4 / 16 / 10, "flop");
+        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 dot products", bench_dot_amx, 16384.0 * 4 / 16 / 10, "flop");
 #endif
 #if GSF__X86
     if (level == GSF_CPU_AVX512_BF16)
