@@ -167,7 +167,7 @@ typedef enum gsf_cpu_level { // instruction sets that kernels may use; AUTO sele
     GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
     GSF_CPU_AVX512_VNNI = 4, // AVX512 and 8-bit dot products
     GSF_CPU_AVX512_BF16 = 5, // AVX512_VNNI and bfloat16 dot products; not by AUTO where these are slower than float32
-    GSF_CPU_AMX = 6,         // AVX512_BF16 and bfloat16 products of tiles; gsf_init_context asks Linux to save the tiles
+    GSF_CPU_AMX = 6,         // AVX512_BF16 and products of tiles, bfloat16 and 8-bit; gsf_init_context asks Linux to save them
     GSF_CPU_SIMD128 = 7,     // four lanes: NEON of 64-bit Arm, SIMD128 of WebAssembly (which is chosen when compiling)
 } gsf_cpu_level;
 
@@ -688,7 +688,7 @@ __asm__(".ifndef gsf.unaligned\n.set gsf.unaligned, 1\n"
 #if defined(__linux__) && defined(__x86_64__) && !defined(__ILP32__) && \
     ((defined(__clang__) && __clang_major__ >= 12) || (!defined(__clang__) && __GNUC__ >= 11))
 #define GSF__AMX 1
-#define GSF__TARGET_AMX __attribute__((target(GSF__AVX512 ",avx512bf16,amx-tile,amx-bf16")))
+#define GSF__TARGET_AMX __attribute__((target(GSF__AVX512 ",avx512bf16,amx-tile,amx-bf16,amx-int8")))
 #define GSF__INLINE_AMX GSF__TARGET_AMX GSF__ALWAYS_INLINE static inline
 #else
 #define GSF__AMX 0
@@ -2689,7 +2689,7 @@ static gsf_cpu_level gsf__detect_cpu_level(void) {
     const unsigned fma = 1u << 12, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;             // leaf 1, ecx
     const unsigned bmi = 1u << 3, avx2 = 1u << 5, f_dq = 1u << 16 | 1u << 17, bw_vl = 3u << 30;     // leaf 7, ebx
     const unsigned vnni = 1u << 11, bf16 = 1u << 5;                                                 // ecx; leaf 7.1, eax
-    const unsigned amx = 1u << 22 | 1u << 24;                                                       // leaf 7, edx
+    const unsigned amx = 1u << 22 | 1u << 24 | 1u << 25;                                            // leaf 7, edx
     const uint64_t ymm = 6, zmm = 0xe6, tiles = 0x60000;                                            // in XCR0
     unsigned one[4], seven[4], more[4];
     gsf__cpuid(1, 0, one);

@@ -4950,6 +4950,7 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
 // this adds no rounding.
 //
 //     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16, or uint8
+//                                                          [group of 16 rows][k/64][16][64] uint8, with tiles (AMX)
 //
 // Up to 4 rows, then in groups of 2 or 4, are multiplied with the 8-bit weights as they are read, one panel after
 // another. Dot-product instructions (VNNI) take fours of unsigned by signed bytes: for them qx is stored as qx + 128,
@@ -4995,7 +4996,14 @@ typedef struct gsf__int8_kernels { // one set per instruction set
     int64_t gemv_rows;
     // out[6][16] = (sums - offsets[16], if qx is unsigned) * rows[6] * columns[16]
     void (*scale)(const int32_t* sums, const int32_t* offsets, const float* rows, const float* columns, float* out);
+    int64_t height;    // rows of a group: 6 or, as tiles, 16
+    int64_t row_bytes; // distance of the rows of a group at the same k
+    int64_t depth, rows, columns; // of a block, at most
+    void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__int8_kernels;
+
+#define GSF__INT8_GROUP(size) GSF__TILE_ROWS, 4 * (size) // height, row_bytes
+#define GSF__INT8_BLOCK_OF(depth) depth, GSF__INT8_ROWS, GSF__INT8_COLUMNS, NULL, NULL
 
 typedef struct gsf__int8_job {
     gsf__linear_job linear;      // desc and bias, for the epilogue
@@ -5088,7 +5096,8 @@ static void gsf__int8_scale_scalar(const int32_t* sums, const int32_t* offsets, 
 
 static const gsf__int8_kernels gsf__int8_scalar = {
     gsf__int8_rotate_scalar, gsf__int8_quantize_scalar, gsf__int8_quantize_scalar, sizeof(int16_t), gsf__int8_widen_scalar,
-    gsf__int8_tile_scalar, NULL, gsf__int8_gemv_scalar, 2, gsf__int8_scale_scalar};
+    gsf__int8_tile_scalar, NULL, gsf__int8_gemv_scalar, 2, gsf__int8_scale_scalar,
+    GSF__INT8_GROUP(2), GSF__INT8_BLOCK_OF(GSF__INT8_DEPTH)};
 
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_NN
@@ -5251,7 +5260,8 @@ GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const int
 
 static const gsf__int8_kernels gsf__int8_avx2 = {
     gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_quantize_avx2, sizeof(int16_t), gsf__int8_widen_avx2,
-    gsf__int8_tile_avx2, NULL, gsf__int8_gemv_avx2, 2, gsf__int8_scale_avx2};
+    gsf__int8_tile_avx2, NULL, gsf__int8_gemv_avx2, 2, gsf__int8_scale_avx2,
+    GSF__INT8_GROUP(2), GSF__INT8_BLOCK_OF(GSF__INT8_DEPTH)};
 
 // ---- int8: AVX-512 kernels with dot products of bytes
 
@@ -5376,16 +5386,104 @@ GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const i
 
 static const gsf__int8_kernels gsf__int8_vnni = {
     gsf__int8_rotate_avx512, gsf__int8_quantize_avx2, gsf__int8_quantize_x_vnni, sizeof(uint8_t), NULL,
-    gsf__int8_tile_vnni, gsf__int8_four_tiles_vnni, gsf__int8_gemv_vnni, GSF__GEMV_ROWS, gsf__int8_scale_vnni};
+    gsf__int8_tile_vnni, gsf__int8_four_tiles_vnni, gsf__int8_gemv_vnni, GSF__GEMV_ROWS, gsf__int8_scale_vnni,
+    GSF__INT8_GROUP(1), GSF__INT8_BLOCK_OF(2 * GSF__INT8_DEPTH)};
 
 #endif
 
-static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
+// ---- int8: kernels for tiles (AMX), as those of bf16: 64 values of 16 rows by 64 of 16 outputs
+
+#if GSF__AMX
+
+GSF__TARGET_AVX512 static void gsf__int8_quantize_x_amx(const float* x, int64_t count, float factor, void* out, int64_t pitch) {
+    const __m512 f = _mm512_set1_ps(factor);
+    const __m512i offset = _mm512_set1_epi32(128);
+    uint8_t* to = (uint8_t*)out;
+    (void)pitch;
+    for (int64_t k = 0; k < count; k += 16) { // a multiple of 64
+        const __m512i q = _mm512_cvtps_epi32(_mm512_mul_ps(_mm512_loadu_ps(x + k), f));
+        _mm_storeu_si128((__m128i*)(void*)(to + k / 64 * 1024 + k % 64), _mm512_cvtepi32_epi8(_mm512_add_epi32(q, offset)));
+    }
+}
+
+GSF__TARGET_AMX static void gsf__int8_tile_amx(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
+    const char *x = (const char*)a, *w = (const char*)b;
+    GSF__AMX_FENCE
+    if (add) _tile_loadd(0, sums, 64);
+    else _tile_zero(0);
+    for (int64_t k = 0; k < count; k += 64, x += 1024, w += 1024) {
+        _tile_loadd(4, x, 64);
+        _tile_loadd(6, w, 64);
+        _tile_dpbusd(0, 4, 6);
+    }
+    _tile_stored(0, sums, 64);
+    GSF__AMX_FENCE
+}
+
+GSF__TARGET_AMX static void gsf__int8_four_tiles_amx(const void* a, int64_t a_next, const int8_t* b, int64_t b_next,
+                                                     int64_t count, int add, int32_t* sums, int64_t next,
+                                                     const int8_t* ahead, int64_t ahead_count) {
+    const int64_t share = gsf__round_up(gsf__ceil_div(64 * ahead_count, count), 64); // per step
+    const char* x = (const char*)a;
+    int32_t* right = sums + next;
+    GSF__AMX_FENCE
+    if (add) {
+        _tile_loadd(0, sums, 64);
+        _tile_loadd(1, right, 64);
+        _tile_loadd(2, sums + GSF__AMX_TILE, 64);
+        _tile_loadd(3, right + GSF__AMX_TILE, 64);
+    } else {
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+    }
+    for (int64_t k = 0; k < count; k += 64, x += 1024, b += 1024, ahead += share) {
+        _tile_loadd(6, b, 64);
+        _tile_loadd(4, x, 64);
+        _tile_dpbusd(0, 4, 6);
+        _tile_loadd(7, b + b_next, 64);
+        _tile_dpbusd(1, 4, 7);
+        _tile_loadd(5, x + a_next, 64);
+        _tile_dpbusd(2, 5, 6);
+        _tile_dpbusd(3, 5, 7);
+        for (int64_t i = 0; i < share; i += 64) _mm_prefetch((const char*)ahead + i, _MM_HINT_T1);
+    }
+    _tile_stored(0, sums, 64);
+    _tile_stored(1, right, 64);
+    _tile_stored(2, sums + GSF__AMX_TILE, 64);
+    _tile_stored(3, right + GSF__AMX_TILE, 64);
+    GSF__AMX_FENCE
+}
+
+GSF__TARGET_AVX512 static void gsf__int8_scale_amx(const int32_t* sums, const int32_t* offsets, const float* rows,
+                                                   const float* columns, float* out) {
+    const __m512i offset = _mm512_loadu_si512(offsets);
+    const __m512 scale = _mm512_loadu_ps(columns);
+    for (int i = 0; i < GSF__AMX_ROWS; i++) {
+        const __m512i v = _mm512_sub_epi32(_mm512_loadu_si512(sums + i * GSF__TILE_COLUMNS), offset);
+        _mm512_storeu_ps(out + i * GSF__TILE_COLUMNS, _mm512_cvtepi32_ps(v) * _mm512_set1_ps(rows[i]) * scale);
+    }
+}
+
+static const gsf__int8_kernels gsf__int8_amx = {
+    gsf__int8_rotate_avx512, gsf__int8_quantize_avx2, gsf__int8_quantize_x_amx, sizeof(uint8_t), NULL,
+    gsf__int8_tile_amx, gsf__int8_four_tiles_amx, gsf__int8_gemv_vnni, GSF__GEMV_ROWS, gsf__int8_scale_amx,
+    GSF__AMX_ROWS, 64, GSF__INT8_DEPTH, 288, 1024, gsf__enter_tiles, gsf__leave_tiles};
+
+#endif
+
+// tiles: there are more rows than gemv takes, and all inputs fill tiles
+static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level, int tiles) {
+#if GSF__AMX
+    if (GSF__REACHES(level, AMX) && tiles) return &gsf__int8_amx;
+#endif
 #if GSF__X86
     if (GSF__REACHES(level, AVX512_VNNI)) return &gsf__int8_vnni;
     if (level >= GSF_CPU_AVX2) return &gsf__int8_avx2;
 #endif
     (void)level;
+    (void)tiles;
     return &gsf__int8_scalar;
 }
 
@@ -5489,7 +5587,7 @@ static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor*
         gsf__nn_destroy_quantized(ctx, &made);
         return GSF_ERROR_OUT_OF_MEMORY;
     }
-    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
+    job.kernels = gsf__int8_kernels_of(ctx->cpu_level, 0);
     job.tensor = weight;
     job.weight = &made;
     gsf__parallel_for(ctx, columns / GSF__TILE_COLUMNS, gsf__quantize_panel, &job);
@@ -5504,18 +5602,18 @@ static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor*
     return GSF_OK;
 }
 
-static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { // six rows of x
+static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { // a group of rows of x
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const gsf__nn_linear_desc* d = &job->linear.desc;
-    const int64_t at = (int64_t)group * GSF__TILE_ROWS, in = job->weight->in;
+    const int64_t height = job->kernels->height, at = (int64_t)group * height, in = job->weight->in;
     float* x = (float*)(void*)(job->workers + (size_t)worker * job->per_worker);
     const size_t size = job->kernels->x_size;
     char* out = job->x + (size_t)(at * job->padded) * size;
-    for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
+    for (int64_t r = 0; r < height; r++) {
         if (at + r < job->rows) memcpy(x, d->x + (job->first + at + r) * d->ldx, (size_t)in * sizeof *x);
         else memset(x, 0, (size_t)in * sizeof *x);
         job->scales[at + r] = gsf__int8_row(job->kernels, 0, x, in, job->padded, job->weight->block,
-                                            out + 4 * (size_t)r * size, 4 * GSF__TILE_ROWS);
+                                            out + r * job->kernels->row_bytes, 4 * height);
     }
 }
 
@@ -5540,15 +5638,16 @@ static void gsf__int8_epilogue(const gsf__int8_job* job, const int32_t* sums, in
 static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows, int64_t column, int64_t columns, int64_t k,
                              int64_t count, int32_t* sums, int64_t next, int16_t* panel, float* tile) {
     const gsf__int8_kernels* kernels = job->kernels;
-    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
-    const int64_t panel_size = job->padded * GSF__TILE_COLUMNS, group_size = job->padded * GSF__TILE_ROWS;
+    const int64_t height = kernels->height, sum_count = height * GSF__TILE_COLUMNS;
+    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, height);
+    const int64_t panel_size = job->padded * GSF__TILE_COLUMNS, group_size = job->padded * height;
     const int8_t* w = job->weight->data + column * job->padded + k * GSF__TILE_COLUMNS;
     const int64_t share = count * GSF__TILE_COLUMNS / groups; // of a panel needed next, prefetched with each tile
     const int8_t* ahead = column + 2 * columns <= job->weight->out ? w + panels * panel_size : w;
     for (int64_t g = 0, step; g < groups; g += step) {
-        const int64_t r = row + g * GSF__TILE_ROWS;
-        const char* x = job->x + (size_t)(r * job->padded + k * GSF__TILE_ROWS) * kernels->x_size;
-        int32_t* s = sums + g * GSF__TILE_SUMS;
+        const int64_t r = row + g * height;
+        const char* x = job->x + (size_t)(r * job->padded + k * height) * kernels->x_size;
+        int32_t* s = sums + g * sum_count;
         step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
         // each half of the groups prefetches one of the two panels
         const int8_t* wanted = g < groups / 2 ? ahead + 2 * g * share : ahead + panel_size + (2 * g - groups) * share;
@@ -5562,9 +5661,9 @@ static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows
         }
         if (k + count < job->padded) continue;
         for (int64_t t = 0; t < step * panels; t++) {
-            const int64_t p = t / step, down = t % step * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
-            gsf__int8_epilogue(job, s + p * next + t % step * GSF__TILE_SUMS, r + down,
-                               gsf__least(row + rows - r - down, GSF__TILE_ROWS), column + c,
+            const int64_t p = t / step, down = t % step * height, c = p * GSF__TILE_COLUMNS;
+            gsf__int8_epilogue(job, s + p * next + t % step * sum_count, r + down,
+                               gsf__least(row + rows - r - down, height), column + c,
                                gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
         }
     }
@@ -5576,10 +5675,11 @@ static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a bloc
     const int64_t column = (int64_t)index / job->row_blocks * job->block_columns;
     const int64_t rows = gsf__least(job->rows - row, job->block_rows);
     const int64_t columns = gsf__least(job->weight->out - column, job->block_columns);
-    const int64_t next = gsf__ceil_div(rows, GSF__TILE_ROWS) * GSF__TILE_SUMS; // between panels
+    const int64_t height = job->kernels->height, next = gsf__round_up(rows, height) * GSF__TILE_COLUMNS; // between panels
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + job->block_rows * job->block_columns);
-    int16_t* panel = (int16_t*)(void*)(tile + GSF__TILE_SUMS);
+    int16_t* panel = (int16_t*)(void*)(tile + height * GSF__TILE_COLUMNS);
+    if (job->kernels->enter) job->kernels->enter();
     for (int64_t k = 0; k < job->padded; k += job->depth) {
         const int64_t count = gsf__least(job->padded - k, job->depth);
         for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
@@ -5591,6 +5691,7 @@ static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a bloc
                              tile);
         }
     }
+    if (job->kernels->leave) job->kernels->leave();
 }
 
 static void gsf__int8_gemv(void* arg, size_t index, int32_t worker) { // some panels of outputs, all rows
@@ -5628,16 +5729,18 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     const int64_t out = job->weight->out;
     size_t x, bytes;
     if (rows > INT64_MAX / 256 || out > INT64_MAX / 256) return 0;
-    job->depth = gsf__even_piece(job->padded, job->kernels->widen ? GSF__INT8_DEPTH : 2 * GSF__INT8_DEPTH, 4);
-    const int64_t most = gsf__round_up(GSF__INT8_HELD / job->padded + 1, GSF__INT8_ROWS);
-    job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
-    job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, 2 * GSF__TILE_ROWS);
-    job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__LINEAR_PAIR);
+    const gsf__int8_kernels* kernels = job->kernels;
+    job->depth = gsf__even_piece(job->padded, kernels->depth, kernels->enter ? 64 : 4);
+    const int64_t most = gsf__round_up(GSF__INT8_HELD / job->padded + 1, kernels->rows);
+    job->held = gsf__even_piece(rows, most, kernels->height);
+    job->block_rows = gsf__even_piece(job->held, kernels->rows, 2 * kernels->height);
+    job->block_columns = gsf__even_piece(out, kernels->columns, GSF__LINEAR_PAIR);
     if (rows <= GSF__GEMV_ROWS) { // all rows at once; outputs in GSF__GEMV_CHUNKS parts
         const int64_t least = GSF__GEMV_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__GEMV_CHUNKS);
         job->block_columns = gsf__round_up(gsf__least(share < least ? least : share, out), GSF__TILE_COLUMNS);
     }
-    const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__LINEAR_PAIR;
+    const int64_t block = 4 * (job->block_rows * job->block_columns + kernels->height * GSF__TILE_COLUMNS) +
+                          2 * job->depth * GSF__LINEAR_PAIR;
     const int64_t row = 4 * job->padded; // the two phases share the memory
     job->per_worker = (size_t)gsf__round_up(block > row ? block : row, 64);
     if (!gsf__mul_size(job->per_worker, workers, &bytes)) return 0;
@@ -5675,8 +5778,8 @@ static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* w
     if (!linear->desc.ldx) linear->desc.ldx = weight->in;
     if (!linear->desc.ldy) linear->desc.ldy = weight->out;
     job.weight = weight;
-    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
     job.padded = gsf__round_up(weight->in, 4);
+    job.kernels = gsf__int8_kernels_of(ctx->cpu_level, desc->rows > GSF__GEMV_ROWS && job.padded % 64 == 0);
     const size_t bytes = gsf__int8_plan(&job, desc->rows, (size_t)ctx->parallel.worker_count);
     if (!bytes)
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld rows x %lld x %lld", (long long)desc->rows,
@@ -5694,7 +5797,7 @@ static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* w
     for (; job.first < desc->rows && desc->rows > GSF__GEMV_ROWS; job.first += job.held) {
         job.rows = gsf__least(desc->rows - job.first, job.held);
         job.row_blocks = gsf__ceil_div(job.rows, job.block_rows);
-        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, GSF__TILE_ROWS), gsf__int8_quantize_rows, &job);
+        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, job.kernels->height), gsf__int8_quantize_rows, &job);
         gsf__parallel_for(ctx, (size_t)(job.row_blocks * column_blocks), gsf__int8_block, &job);
     }
     gsf__nn_destroy_workspace(ctx, &own);

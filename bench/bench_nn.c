@@ -123,23 +123,32 @@ GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int32_t wor
 #endif
 
 #if GSF__AMX
-GSF__TARGET_AMX static void bench_dot_amx(void* arg, size_t chunk, int32_t worker) { // products of tiles that are loaded once
-    memset((float*)arg + 16 * chunk, 0, 16 * sizeof(float));
-    (void)worker;
-    gsf__enter_tiles();
-    _tile_zero(4);
-    _tile_zero(5);
-    for (int i = 0; i < FMA_ROUNDS / 16; i++) {
-        _tile_dpbf16ps(0, 4, 5);
-        _tile_dpbf16ps(1, 4, 5);
-        _tile_dpbf16ps(2, 4, 5);
-        _tile_dpbf16ps(3, 4, 5);
+// Products of tiles that are loaded once: four in a sixteenth of the rounds
+#define BENCH_TILES(name, multiply)                                      \
+    GSF__TARGET_AMX static void name(void* arg, size_t chunk, int32_t worker) { \
+        memset((float*)arg + 16 * chunk, 0, 16 * sizeof(float));         \
+        (void)worker;                                                    \
+        gsf__enter_tiles();                                              \
+        _tile_zero(4);                                                   \
+        _tile_zero(5);                                                   \
+        for (int i = 0; i < FMA_ROUNDS / 16; i++) {                      \
+            multiply(0, 4, 5);                                           \
+            multiply(1, 4, 5);                                           \
+            multiply(2, 4, 5);                                           \
+            multiply(3, 4, 5);                                           \
+        }                                                                \
+        gsf__leave_tiles();                                              \
     }
-    gsf__leave_tiles();
-}
+BENCH_TILES(bench_tiles_bf16, _tile_dpbf16ps)
+BENCH_TILES(bench_tiles_int8, _tile_dpbusd)
+#define BENCH_TILE_WORK (4.0 / 16 / FMA_CHAINS * 2 * 16 * 16) // times the values of a row, per step of bench_peak_rate
 #endif
 
 static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* ops) { // ops: per step; NULL: no instructions for it
+#if GSF__AMX
+    *ops = 64 * BENCH_TILE_WORK;
+    if (level == GSF_CPU_AMX) return bench_tiles_int8;
+#endif
 #if GSF__X86
     *ops = level >= GSF_CPU_AVX512_VNNI ? 128.0 : level >= GSF_CPU_AVX512 ? 64.0 : 32.0;
     if (level >= GSF_CPU_AVX512_VNNI) return bench_dot_vnni;
@@ -160,9 +169,10 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     peak->flops = bench_peak_rate(o->json, &ctx, "machine: multiply-add", fma, work, "flop");
     const gsf_chunk_fn dot = bench_dot_of(level, &work);
     if (dot) peak->ops = bench_peak_rate(o->json, &ctx, "machine: integer dot products", dot, work, "op");
-#if GSF__AMX // a step of the rate is ten steps of FMA_ROUNDS; here, four tiles in a sixteenth of them
+#if GSF__AMX
     if (level == GSF_CPU_AMX)
-        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 dot products", bench_dot_amx, 16384.0 * 4 / 16 / 10, "flop");
+        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 dot products", bench_tiles_bf16, 32 * BENCH_TILE_WORK,
+                                     "flop");
 #endif
 #if GSF__X86
     if (level == GSF_CPU_AVX512_BF16)

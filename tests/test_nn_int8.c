@@ -219,7 +219,7 @@ static void test_types(gsf_context* ctx) {
 static void test_same_bits(gsf_cpu_level best) {
     static const int64_t sizes[][3] = {{1, 300, 700}, {4, 1030, 900}, {3, 5, 40}, {7, 1, 5}, {13, 7, 3}, {6, 1024, 400},
                                        {50, 1044, 33}, {401, 130, 500},
-                                       {200, 2048, 90}, {390, 96, 20}, {33, 12, 800}};
+                                       {200, 2048, 90}, {390, 96, 20}, {33, 12, 800}, {300, 704, 70}};
     for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
         layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], i % 2 ? 1 : 0);
         float* first = (float*)malloc(l.y_count * sizeof(float));
@@ -259,7 +259,7 @@ static void test_extremes(gsf_cpu_level best) {
     static int16_t a[6 * COUNT], b[16 * COUNT];
     int32_t sums[GSF__TILE_SUMS];
     for (int level = GSF_CPU_SCALAR; level <= (int)best; level++) {
-        const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level);
+        const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level, 0);
         const int is_unsigned = kernels->x_size == 1;
         for (int sign = -1; sign <= 1; sign += 2) {
             const uint32_t once = (uint32_t)(sign * 127 * (is_unsigned ? 255 : 127) * COUNT);
@@ -286,7 +286,7 @@ static void test_four_tiles(gsf_cpu_level best) {
     int8_t w[2 * PANEL];
     int32_t sums[4 * GSF__TILE_SUMS], alone[GSF__TILE_SUMS];
     for (int level = GSF_CPU_SCALAR; level <= (int)best; level++) {
-        const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level);
+        const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level, 0);
         if (!kernels->four_tiles) continue;
         for (size_t i = 0; i < sizeof a; i++) a[i] = (uint8_t)(test_random_bits(&seed) >> 56);
         for (size_t i = 0; i < sizeof w; i++) w[i] = (int8_t)(test_random_bits(&seed) >> 56);
