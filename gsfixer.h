@@ -2670,7 +2670,6 @@ static uint64_t gsf__saved_state(void) {
     return (uint64_t)high << 32 | low;
 #endif
 }
-#endif
 
 // Whether threads of this process may use tiles: Linux wants to be asked, as they enlarge what it saves of a thread.
 static int gsf__may_use_tiles(void) {
@@ -2682,6 +2681,7 @@ static int gsf__may_use_tiles(void) {
     return 0;
 #endif
 }
+#endif
 
 // By cpuid itself: __builtin_cpu_supports needs a run-time library that clang-cl does not link.
 static gsf_cpu_level gsf__detect_cpu_level(void) {

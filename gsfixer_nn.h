@@ -4851,10 +4851,11 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
         plan->depth = gsf__even_piece(in, kernels->depth, kernels->step > 8 ? kernels->step : 8);
-        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : kernels->rows, 2 * kernels->height);
+        const int64_t highest = plan->lone ? (int64_t)GSF__LINEAR_LONE_ROWS : kernels->rows;
+        plan->block_rows = gsf__even_piece(rows, highest, 2 * kernels->height);
         plan->row_blocks = gsf__ceil_div(rows, plan->block_rows);
         const int64_t most = GSF__LINEAR_PACKED / in / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
-        const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : kernels->columns;
+        const int64_t widest = plan->lone ? (int64_t)GSF__LINEAR_LONE_COLUMNS : kernels->columns;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
@@ -6503,7 +6504,7 @@ static size_t gsf__attention_plan(gsf__attention_job* job) {
     if (job->ranges < wanted) job->ranges = wanted < most ? wanted : most > job->ranges ? most : job->ranges;
     if (job->ranges < 1) return 0;
     const int64_t size = (d->queries - 1) / job->ranges + 1;
-    job->range_size = gsf__round_up(size, job->parts ? job->parts->group : GSF__ATT_GROUP);
+    job->range_size = gsf__round_up(size, job->parts ? job->parts->group : (int64_t)GSF__ATT_GROUP);
     job->ranges = (d->queries - 1) / job->range_size + 1; // rounding up may leave the last ones empty
     return (size_t)(d->heads * job->ranges);
 }
@@ -19790,7 +19791,9 @@ GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_at
     gsf__attention_fill_in(d);
     job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
     job.pitch = gsf__grad_pitch(d->head_dim);
-    job.tiles = GSF__AMX && d->bf16 && GSF__REACHES(ctx->cpu_level, AMX);
+#if GSF__AMX
+    job.tiles = d->bf16 && GSF__REACHES(ctx->cpu_level, AMX);
+#endif
     job.scratch_floats = gsf__attention_grad_lay_out(&job, NULL, &blocks);
     if (!gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &count))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld queries", (long long)d->queries);
