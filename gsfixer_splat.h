@@ -757,8 +757,9 @@ typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
 
 // The loop's settings for few photos: 1200 iterations, regularisers (train.depth_smoothness; dropout and opacity_decay, which
 // are twice as strong for up to 3 photos as for 6 or more, in between in inverse proportion to view_count), train.lr_scales
-// (its default for up to 6 photos, twice that for 9 or more, in between linear), the settings of `quality`, and from the scene
-// (NULL = none) the near plane for all its cameras and the points that determine the axes of the path, which are borrowed.
+// for a dense start (its default for up to 6 photos, twice that for 9 or more, in between linear), the settings of `quality`,
+// and from the scene (NULL = none) the near plane for all its cameras and the points that determine the axes of the path,
+// which are borrowed.
 GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, size_t view_count, gsf_quality quality);
 
 // Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Use

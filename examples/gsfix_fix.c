@@ -155,7 +155,8 @@ void gsfix_settle_train(gsf_train_desc* train, gsf_initial_kind start, size_t vi
     const gsf_train_desc few = gsf_splat_resolve_few_view_desc(NULL, view_count, GSF_QUALITY_BALANCED).train;
     if (train->dropout == BY_VIEWS) train->dropout = few.dropout;
     if (train->opacity_decay == BY_VIEWS) train->opacity_decay = few.opacity_decay;
-    if (train->lr_scales == BY_VIEWS) train->lr_scales = few.lr_scales;
+    if (train->lr_scales == BY_VIEWS) // the splats of a sparse start are large and must not grow faster
+        train->lr_scales = start == GSF_INITIAL_AUTO || start == GSF_INITIAL_DENSE ? few.lr_scales : 0.0f;
     if (train->densify_until == BY_START)
         train->densify_until = start == GSF_INITIAL_TRACKS && !train->mcmc ? 2 * train->iterations / 3 : 0;
 }
