@@ -231,12 +231,17 @@ static void test_resume(gsf_context* ctx) {
 }
 
 // A step with products of bf16: within its rounding of that in float32, and the same bits with other workers.
-static void test_bf16(gsf_context* ctx, gsf_context* others) {
+static void test_bf16(gsf_context* ctx) {
     training plain, rounded, again;
+    gsf_context others;
+    memset(&others, 0, sizeof others);
+    others.cpu_level = ctx->cpu_level; // by default, another one may be chosen than the highest
+    work_backwards(&others);
+    CHECK_OK(&others, gsf_init_context(&others));
     double losses[3], error = 0.0, size = 0.0;
     training* const all[] = {&plain, &rounded, &again};
     for (int i = 0; i < 3; i++) {
-        open_training(all[i], i == 2 ? others : ctx);
+        open_training(all[i], i == 2 ? &others : ctx);
         all[i]->net.bf16 = i > 0;
         CHECK_OK(all[i]->ctx, gsf__nn_train_transformer(all[i]->ctx, &all[i]->net, &all[i]->params, &all[i]->desc, &losses[i]));
     }
@@ -366,7 +371,7 @@ int main(void) {
     close_training(&t);
     close_training(&again);
     test_resume(&ctx);
-    test_bf16(&ctx, &others);
+    test_bf16(&ctx);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) {
         gsf_context at;
         memset(&at, 0, sizeof at);
