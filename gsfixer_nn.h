@@ -3024,7 +3024,16 @@ GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 c
     gsf__nn_store_columns(m, to, to_ld);
 }
 
-// Pairs of bfloat16 are held in float lanes.
+// to[j to_ld + i] = from[i ld + j] for i, j < 8, whatever the bits
+GSF__INLINE_AVX2 void gsf__nn_turn8(const float* from, int64_t ld, float* to, int64_t to_ld) {
+    __m256 m[8] = {_mm256_loadu_ps(from),          _mm256_loadu_ps(from + ld),     _mm256_loadu_ps(from + 2 * ld),
+                   _mm256_loadu_ps(from + 3 * ld), _mm256_loadu_ps(from + 4 * ld), _mm256_loadu_ps(from + 5 * ld),
+                   _mm256_loadu_ps(from + 6 * ld), _mm256_loadu_ps(from + 7 * ld)};
+    gsf__nn_store_columns(m, to, to_ld);
+}
+
+// Pairs of bfloat16 are held in float lanes. No arithmetic on these: an infinity beside another value is a NaN there, and a
+// value beside a zero is denormal.
 
 GSF__INLINE_BF16 __m512 gsf__nn_add_pairs(__m512 sum, __m512 a, __m512 b) { // sum + a[0] b[0] + a[1] b[1]
     return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_castps_si512(a), (__m512bh)_mm512_castps_si512(b));
@@ -4553,9 +4562,8 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
             _mm512_storeu_ps(units[r], gsf__pairs_along((const char*)(x + (there ? r * ldx + k : 0)), GSF_NN_F32, 4,
                                                         there ? count - k : 0));
         }
-        const __m256 none = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
-        gsf__nn_transpose8(units[0], 16, none, one, out, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
-        gsf__nn_transpose8(units[0] + 8, 16, none, one, out + 8 * GSF__TILE_ROWS, GSF__TILE_ROWS);
+        gsf__nn_turn8(units[0], 16, out, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
+        gsf__nn_turn8(units[0] + 8, 16, out + 8 * GSF__TILE_ROWS, GSF__TILE_ROWS);
     }
 }
 
@@ -4643,55 +4651,63 @@ GSF__TARGET_BF16 static void gsf__pack_columns_amx(const float* x, int64_t ldx, 
     }
 }
 
+// Over `steps` tiles of KiB along the inner dimension; multiply: of bf16 or of bytes.
+#define GSF__AMX_ONE(multiply, a, b, steps)                  \
+    const char *x_ = (const char*)(a), *w_ = (const char*)(b); \
+    GSF__AMX_FENCE                                           \
+    if (add) _tile_loadd(0, sums, 64);                       \
+    else _tile_zero(0);                                      \
+    for (int64_t k_ = (steps); k_ > 0; k_--, x_ += 1024, w_ += 1024) { \
+        _tile_loadd(4, x_, 64);                              \
+        _tile_loadd(6, w_, 64);                              \
+        multiply(0, 4, 6);                                   \
+    }                                                        \
+    _tile_stored(0, sums, 64);                               \
+    GSF__AMX_FENCE
+
+// Two groups, a_next bytes apart, by two panels, b_next bytes apart; fetches `share` bytes from `ahead` on in each step.
+#define GSF__AMX_FOUR(multiply, a, a_next, b, b_next, steps, ahead, share)                                     \
+    const char *x_ = (const char*)(a), *w_ = (const char*)(b), *ahead_ = (const char*)(ahead);                 \
+    GSF__AMX_FENCE                                                                                             \
+    if (add) {                                                                                                 \
+        _tile_loadd(0, sums, 64);                                                                              \
+        _tile_loadd(1, right, 64);                                                                             \
+        _tile_loadd(2, sums + GSF__AMX_TILE, 64);                                                              \
+        _tile_loadd(3, right + GSF__AMX_TILE, 64);                                                             \
+    } else {                                                                                                   \
+        _tile_zero(0);                                                                                         \
+        _tile_zero(1);                                                                                         \
+        _tile_zero(2);                                                                                         \
+        _tile_zero(3);                                                                                         \
+    }                                                                                                          \
+    for (int64_t k_ = (steps); k_ > 0; k_--, x_ += 1024, w_ += 1024, ahead_ += (share)) {                      \
+        _tile_loadd(6, w_, 64);                                                                                \
+        _tile_loadd(4, x_, 64);                                                                                \
+        multiply(0, 4, 6);                                                                                     \
+        _tile_loadd(7, w_ + (b_next), 64);                                                                     \
+        multiply(1, 4, 7);                                                                                     \
+        _tile_loadd(5, x_ + (a_next), 64);                                                                     \
+        multiply(2, 5, 6);                                                                                     \
+        multiply(3, 5, 7);                                                                                     \
+        for (int64_t i_ = 0; i_ < (share); i_ += 64) _mm_prefetch(ahead_ + i_, _MM_HINT_T1);                   \
+    }                                                                                                          \
+    _tile_stored(0, sums, 64);                                                                                 \
+    _tile_stored(1, right, 64);                                                                                \
+    _tile_stored(2, sums + GSF__AMX_TILE, 64);                                                                 \
+    _tile_stored(3, right + GSF__AMX_TILE, 64);                                                                \
+    GSF__AMX_FENCE
+
 GSF__TARGET_AMX static void gsf__tile_amx(const float* a, const float* b, int64_t count, int add, float* sums,
                                           const float* ahead, int64_t ahead_count) {
     for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
-    GSF__AMX_FENCE
-    if (add) _tile_loadd(0, sums, 64);
-    else _tile_zero(0);
-    for (int64_t k = 0; k < count; k += 16, a += GSF__AMX_TILE, b += GSF__AMX_TILE) {
-        _tile_loadd(4, a, 64);
-        _tile_loadd(6, b, 64);
-        _tile_dpbf16ps(0, 4, 6);
-    }
-    _tile_stored(0, sums, 64);
-    GSF__AMX_FENCE
+    GSF__AMX_ONE(_tile_dpbf16ps, a, b, count / 16)
 }
 
 GSF__TARGET_AMX static void gsf__four_tiles_amx(const float* a, const float* b, int64_t count, int add, float* sums,
                                                 int64_t next, const float* ahead, int64_t ahead_count) {
-    const int64_t across = GSF__AMX_ROWS * count;
+    const int64_t across = 64 * count, share = gsf__round_up(gsf__ceil_div(64 * ahead_count, count), 64); // bytes
     float* right = sums + next;
-    const int64_t share = gsf__round_up(gsf__ceil_div(ahead_count, count / 16), 16); // per step
-    GSF__AMX_FENCE
-    if (add) {
-        _tile_loadd(0, sums, 64);
-        _tile_loadd(1, right, 64);
-        _tile_loadd(2, sums + GSF__AMX_TILE, 64);
-        _tile_loadd(3, right + GSF__AMX_TILE, 64);
-    } else {
-        _tile_zero(0);
-        _tile_zero(1);
-        _tile_zero(2);
-        _tile_zero(3);
-    }
-    for (int64_t k = 0; k < count; k += 16, a += GSF__AMX_TILE, b += GSF__AMX_TILE) {
-        _tile_loadd(6, b, 64);
-        _tile_loadd(4, a, 64);
-        _tile_dpbf16ps(0, 4, 6);
-        _tile_loadd(7, b + across, 64);
-        _tile_dpbf16ps(1, 4, 7);
-        _tile_loadd(5, a + across, 64);
-        _tile_dpbf16ps(2, 5, 6);
-        _tile_dpbf16ps(3, 5, 7);
-        for (int64_t i = 0; i < share; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
-        ahead += share;
-    }
-    _tile_stored(0, sums, 64);
-    _tile_stored(1, right, 64);
-    _tile_stored(2, sums + GSF__AMX_TILE, 64);
-    _tile_stored(3, right + GSF__AMX_TILE, 64);
-    GSF__AMX_FENCE
+    GSF__AMX_FOUR(_tile_dpbf16ps, a, across, b, across, count / 16, ahead, share)
 }
 
 static const gsf__linear_kernels gsf__linear_amx = {
@@ -5375,14 +5391,19 @@ GSF__TARGET_VNNI static void gsf__int8_gemv_vnni(const void* a, int64_t rows, co
     else gsf__int8_gemv_rows(x, 4, w, count, sums);
 }
 
-GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const int32_t* offsets, const float* rows,
-                                                    const float* columns, float* out) {
+GSF__INLINE_AVX512 void gsf__int8_scale_rows(const int32_t* sums, const int32_t* offsets, const float* rows, int count,
+                                             const float* columns, float* out) {
     const __m512i offset = _mm512_loadu_si512(offsets);
     const __m512 scale = _mm512_loadu_ps(columns);
-    for (int i = 0; i < GSF__TILE_ROWS; i++) {
+    for (int i = 0; i < count; i++) {
         const __m512i v = _mm512_sub_epi32(_mm512_loadu_si512(sums + i * GSF__TILE_COLUMNS), offset);
         _mm512_storeu_ps(out + i * GSF__TILE_COLUMNS, _mm512_cvtepi32_ps(v) * _mm512_set1_ps(rows[i]) * scale);
     }
+}
+
+GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const int32_t* offsets, const float* rows,
+                                                    const float* columns, float* out) {
+    gsf__int8_scale_rows(sums, offsets, rows, GSF__TILE_ROWS, columns, out);
 }
 
 static const gsf__int8_kernels gsf__int8_vnni = {
@@ -5408,63 +5429,20 @@ GSF__TARGET_AVX512 static void gsf__int8_quantize_x_amx(const float* x, int64_t 
 }
 
 GSF__TARGET_AMX static void gsf__int8_tile_amx(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
-    const char *x = (const char*)a, *w = (const char*)b;
-    GSF__AMX_FENCE
-    if (add) _tile_loadd(0, sums, 64);
-    else _tile_zero(0);
-    for (int64_t k = 0; k < count; k += 64, x += 1024, w += 1024) {
-        _tile_loadd(4, x, 64);
-        _tile_loadd(6, w, 64);
-        _tile_dpbusd(0, 4, 6);
-    }
-    _tile_stored(0, sums, 64);
-    GSF__AMX_FENCE
+    GSF__AMX_ONE(_tile_dpbusd, a, b, count / 64)
 }
 
 GSF__TARGET_AMX static void gsf__int8_four_tiles_amx(const void* a, int64_t a_next, const int8_t* b, int64_t b_next,
                                                      int64_t count, int add, int32_t* sums, int64_t next,
                                                      const int8_t* ahead, int64_t ahead_count) {
-    const int64_t share = gsf__round_up(gsf__ceil_div(64 * ahead_count, count), 64); // per step
-    const char* x = (const char*)a;
+    const int64_t share = gsf__round_up(gsf__ceil_div(64 * ahead_count, count), 64);
     int32_t* right = sums + next;
-    GSF__AMX_FENCE
-    if (add) {
-        _tile_loadd(0, sums, 64);
-        _tile_loadd(1, right, 64);
-        _tile_loadd(2, sums + GSF__AMX_TILE, 64);
-        _tile_loadd(3, right + GSF__AMX_TILE, 64);
-    } else {
-        _tile_zero(0);
-        _tile_zero(1);
-        _tile_zero(2);
-        _tile_zero(3);
-    }
-    for (int64_t k = 0; k < count; k += 64, x += 1024, b += 1024, ahead += share) {
-        _tile_loadd(6, b, 64);
-        _tile_loadd(4, x, 64);
-        _tile_dpbusd(0, 4, 6);
-        _tile_loadd(7, b + b_next, 64);
-        _tile_dpbusd(1, 4, 7);
-        _tile_loadd(5, x + a_next, 64);
-        _tile_dpbusd(2, 5, 6);
-        _tile_dpbusd(3, 5, 7);
-        for (int64_t i = 0; i < share; i += 64) _mm_prefetch((const char*)ahead + i, _MM_HINT_T1);
-    }
-    _tile_stored(0, sums, 64);
-    _tile_stored(1, right, 64);
-    _tile_stored(2, sums + GSF__AMX_TILE, 64);
-    _tile_stored(3, right + GSF__AMX_TILE, 64);
-    GSF__AMX_FENCE
+    GSF__AMX_FOUR(_tile_dpbusd, a, a_next, b, b_next, count / 64, ahead, share)
 }
 
 GSF__TARGET_AVX512 static void gsf__int8_scale_amx(const int32_t* sums, const int32_t* offsets, const float* rows,
                                                    const float* columns, float* out) {
-    const __m512i offset = _mm512_loadu_si512(offsets);
-    const __m512 scale = _mm512_loadu_ps(columns);
-    for (int i = 0; i < GSF__AMX_ROWS; i++) {
-        const __m512i v = _mm512_sub_epi32(_mm512_loadu_si512(sums + i * GSF__TILE_COLUMNS), offset);
-        _mm512_storeu_ps(out + i * GSF__TILE_COLUMNS, _mm512_cvtepi32_ps(v) * _mm512_set1_ps(rows[i]) * scale);
-    }
+    gsf__int8_scale_rows(sums, offsets, rows, GSF__AMX_ROWS, columns, out);
 }
 
 static const gsf__int8_kernels gsf__int8_amx = {
@@ -6236,7 +6214,7 @@ GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* from, int64_
             _mm256_storeu_ps(units[r], _mm256_castsi256_ps(gsf__nn_round_bf16(v)));
         }
         if (dim - i >= 16)
-            gsf__nn_transpose8(units[0], 8, _mm256_setzero_ps(), _mm256_set1_ps(1.0f), to + i / 2 * to_ld, to_ld);
+            gsf__nn_turn8(units[0], 8, to + i / 2 * to_ld, to_ld);
         else
             for (int64_t u = 0; u < (dim - i) / 2; u++)
                 for (int r = 0; r < 8; r++) to[(i / 2 + u) * to_ld + r] = units[r][u];

@@ -171,6 +171,26 @@ static void test_bf16(gsf_context* ctx) {
         }
 }
 
+// Each row has one value, of either place in a pair, beside a zero or an infinity: bf16 keeps both, even where the processor
+// takes denormal floats for zero.
+static void test_bf16_pairs(gsf_context* ctx) {
+    layer l = make_layer(37, 70, 20, GSF_NN_BF16, 0, 0);
+    for (int infinite = 0; infinite < 2; infinite++) {
+        for (int64_t m = 0; m < 37; m++)
+            for (int64_t k = 0; k < 70; k++) l.x[m * 70 + k] = k == m ? 0.5f : infinite && k == (m ^ 1) ? INFINITY : 0.0f;
+        int wrong = 0;
+        l.desc.bf16 = 1;
+        run(ctx, NULL, &l);
+        for (int64_t m = 0; m < 37; m++)
+            for (int64_t n = 0; n < 20; n++) {
+                const double expected = infinite ? (l.w[n * 70 + (m ^ 1)] > 0.0 ? INFINITY : -INFINITY) : 0.5 * l.w[n * 70 + m];
+                wrong += (double)l.y[m * 20 + n] != expected;
+            }
+        CHECK(wrong == 0);
+    }
+    free_layer(&l);
+}
+
 // Sizes at which the work is split: several blocks of rows, groups of outputs, blocks of outputs.
 static void test_blocks(gsf_context* ctx) {
     static const int64_t sizes[][3] = {{320, 40, 400}, {321, 70, 300}, {400, 300, 90}, {650, 13, 1600},
@@ -319,6 +339,7 @@ int main(void) {
         if ((int)ctx.cpu_level != level) continue;
         test_shapes(&ctx);
         test_bf16(&ctx);
+        test_bf16_pairs(&ctx);
         test_blocks(&ctx);
         test_workers(ctx.cpu_level);
         test_special(&ctx);
