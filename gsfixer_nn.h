@@ -3777,11 +3777,12 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 // A block of a few hundred rows and outputs is one unit of parallel work. It traverses the inner dimension in steps of
 // `depth`, so that this much of its rows fits the L2 cache and of one panel the L1 cache; each tile of 6 x 16 sums is
 // held in registers. AVX-512 computes two groups by two panels at a time, 12 x 32 sums, on request with pairs of bf16
-// in the place of floats, AMX such pairs of groups of 16 rows. After the last step a tile goes through bias, activation, gate
-// and residual into y while it is still in cache. The weights are packed once per call for all blocks, or, if one block covers
-// all rows, by the worker that needs them. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are
-// not packed but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result
-// does not depend on the number of workers.
+// in the place of floats, AMX such pairs of groups of 16 rows. After the last step the block goes through bias, activation,
+// gate and residual into y, row by row: y is often larger than the caches. The weights are packed once per call for all blocks,
+// or, if one block covers all rows, by the worker that needs them; x by each block, or, where tiles are so fast that it would
+// show (AMX), once per call. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are not packed but
+// used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result does not depend
+// on the number of workers.
 
 enum {
     GSF__TILE_ROWS = 6,
@@ -3793,6 +3794,8 @@ enum {
     GSF__LINEAR_COLUMNS = 768,
     GSF__LINEAR_LONE_ROWS = 320,      // up to this many rows form a single block
     GSF__LINEAR_LONE_COLUMNS = 192,
+    GSF__PACK_STRIPS = 32,            // panels or groups of a unit of packing what is stored transposed
+    GSF__PACK_STEPS = 16,             // packed values of them at a time
     GSF__GEMV_ROWS = 4,               // up to this many rows, weights are not packed
     GSF__GEMV_CHUNKS = 32,            // maximum number of work units; few, as the hardware prefetcher restarts in each
     GSF__GEMV_BYTES = 1 << 16,        // minimum bytes of weights per unit
@@ -3838,14 +3841,15 @@ typedef struct gsf__linear_kernels { // one set per instruction set; `count`: va
     int64_t height;    // rows of a group: 6 or, as tiles, 16
     int64_t step;      // packed values come in multiples of this, filled up with zeros
     int64_t depth, rows, columns; // of a block, at most
+    int shares_x;      // x is packed once for all blocks; pack_rows must not write beyond its group
     void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__linear_kernels;
 
 typedef struct gsf__linear_plan { // how a product is divided; depends on its sizes only
     int64_t depth;                // of a step through the inner dimension
-    int64_t block_rows, block_columns, row_blocks;
-    int64_t group_columns;        // outputs packed at a time
-    int gemv, lone;                // up to 4 rows; one block covers all rows
+    int64_t block_rows, block_columns;
+    int64_t group_rows, group_columns; // rows and outputs packed at a time
+    int gemv, lone, shares_x;      // up to 4 rows; one block covers all rows; x is packed for several blocks
     size_t shared, per_worker;    // floats of scratch
 } gsf__linear_plan;
 
@@ -3856,7 +3860,8 @@ struct gsf__linear_job {
     int64_t in, out, ldw;
     int64_t length;               // `in` in units, rounded up
     int64_t first, columns;       // the current group of outputs
-    float *bias, *packed, *gemv_x; // bias: zeros if there is none, 16 more than `out`
+    int64_t first_row, rows;      // the current group of rows
+    float *bias, *packed, *packed_x, *gemv_x; // bias: zeros if there is none, 16 more than `out`
     float* workers;
 };
 
@@ -3963,7 +3968,7 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 
 static const gsf__linear_kernels gsf__linear_scalar = {
     gsf__pack_weights_scalar, gsf__pack_transposed_scalar, gsf__pack_rows_scalar, gsf__pack_columns_scalar,
-    gsf__tile_scalar, NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, NULL, NULL};
+    gsf__tile_scalar, NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, 0, NULL, NULL};
 
 // ---- linear: where kernels are compiled for the instruction sets
 // Those of all sections written in the vector vocabulary, except the gradients' of >>nn training: one inclusion for all, as
@@ -4282,7 +4287,7 @@ GSF__TARGET_AVX2 static void gsf__gemv_avx2(const gsf__linear_job* job, int64_t 
 
 static const gsf__linear_kernels gsf__linear_avx2 = {
     gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
-    gsf__tile_avx2, NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, NULL, NULL};
+    gsf__tile_avx2, NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1, GSF__TILE_ROWS, 1, GSF__LINEAR_BLOCK, 0, NULL, NULL};
 
 // ---- linear: AVX-512 kernels
 
@@ -4490,7 +4495,7 @@ GSF__TARGET_AVX512 static void gsf__gemv_avx512(const gsf__linear_job* job, int6
 static const gsf__linear_kernels gsf__linear_avx512 = {
     gsf__pack_weights_avx2, gsf__pack_transposed_avx2, gsf__pack_rows_avx2, gsf__pack_columns_scalar,
     gsf__tile_avx2, gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 1, GSF__TILE_ROWS, 1,
-    GSF__LINEAR_BLOCK, NULL, NULL};
+    GSF__LINEAR_BLOCK, 0, NULL, NULL};
 
 // ---- linear: kernels for pairs of bf16
 
@@ -4511,11 +4516,17 @@ GSF__INLINE_BF16 __m512 gsf__pairs_along(const char* p, gsf_nn_dtype dtype, size
 
 // Pairs of a value and that of the next row, for sixteen columns; `left` rows exist.
 GSF__INLINE_BF16 __m512 gsf__pairs_across(const char* p, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t left) {
+    if (dtype == GSF_NN_BF16) {
+        const __m256i low = _mm256_maskz_loadu_epi16(gsf__nn_mask16(left > 0 ? columns : 0), p);
+        const __m256i high = _mm256_maskz_loadu_epi16(gsf__nn_mask16(left > 1 ? columns : 0), p + pitch);
+        return _mm512_castsi512_ps(_mm512_or_si512(_mm512_cvtepu16_epi32(low),
+                                                   _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16)));
+    }
     const __m512 low = gsf__load_first16(p, dtype, left > 0 ? columns : 0);
     const __m512 high = gsf__load_first16(p + pitch, dtype, left > 1 ? columns : 0);
-    const __m512i first = _mm512_cvtepu16_epi32(gsf__nn_round_bf16(low));
-    const __m512i second = _mm512_cvtepu16_epi32(gsf__nn_round_bf16(high));
-    return _mm512_castsi512_ps(_mm512_or_si512(first, _mm512_slli_epi32(second, 16)));
+    const __m512i alternate = _mm512_or_si512(_mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0),
+        _mm512_slli_epi32(_mm512_set_epi32(31, 30, 29, 28, 27, 26, 25, 24, 23, 22, 21, 20, 19, 18, 17, 16), 16));
+    return _mm512_castsi512_ps(_mm512_permutexvar_epi16(alternate, (__m512i)_mm512_cvtne2ps_pbh(high, low)));
 }
 
 // to[i][j] = m[j][i]
@@ -4606,7 +4617,7 @@ GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b
 
 static const gsf__linear_kernels gsf__linear_bf16 = {
     gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_bf16, gsf__pack_columns_bf16, gsf__tile_bf16,
-    gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__TILE_ROWS, 16, GSF__LINEAR_BLOCK, NULL, NULL};
+    gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__TILE_ROWS, 16, GSF__LINEAR_BLOCK, 0, NULL, NULL};
 
 #endif // GSF__X86
 
@@ -4714,7 +4725,7 @@ static const gsf__linear_kernels gsf__linear_amx = {
     gsf__pack_weights_bf16, gsf__pack_transposed_bf16, gsf__pack_rows_amx, gsf__pack_columns_amx, gsf__tile_amx,
     gsf__four_tiles_amx, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2, GSF__AMX_ROWS, 16,
     128, 288, 1024, // a step of two groups and two panels fits the L1 cache, the sums of a block the L2 cache
-    gsf__enter_tiles, gsf__leave_tiles};
+    1, gsf__enter_tiles, gsf__leave_tiles};
 
 #endif
 
@@ -4761,46 +4772,64 @@ static void gsf__pack_group(const gsf__linear_job* job, int64_t row, int64_t row
     else kernels->pack_rows(job->desc.x + row * ld + value, ld, height, values, out);
 }
 
-// Outputs of a unit of packing: a panel. Transposed weights are read across their rows: several, to read more of each page.
-static int64_t gsf__linear_packed_at_once(const gsf__linear_job* job) {
-    return job->desc.transposed_weight ? 4 * GSF__TILE_COLUMNS : GSF__TILE_COLUMNS;
+// The group that starts at row `at` of the current rows, at step k, as gsf__packed_panel.
+static float* gsf__packed_group(const gsf__linear_job* job, int64_t at, int64_t k, int64_t count) {
+    return job->packed_x + k * gsf__round_up(job->rows, job->kernels->height) + at * count;
 }
 
-static void gsf__linear_pack_panels(void* arg, size_t index, int32_t worker) { // of the current group, their full depth
-    const gsf__linear_job* job = (const gsf__linear_job*)arg;
-    const int64_t width = gsf__linear_packed_at_once(job), first = (int64_t)index * width;
-    const int64_t end = gsf__least(first + width, job->columns);
+typedef struct gsf__linear_packing { // of the current outputs, or of the current rows of x
+    const gsf__linear_job* job;
+    int of_x, turned;                // turned: stored transposed
+    int64_t strip, width, total;     // outputs or rows: of a panel or group, of a unit of work, all
+    int64_t across;                  // units of work side by side
+} gsf__linear_packing;
+
+// A strip's rows are read one after the other, all steps. What is stored transposed is read across its rows: one step of many
+// strips, to read much of each row, and few rows at a time, for the L1 cache.
+static void gsf__linear_pack(void* arg, size_t index, int32_t worker) {
+    const gsf__linear_packing* p = (const gsf__linear_packing*)arg;
+    const gsf__linear_job* job = p->job;
+    const int64_t begin = (int64_t)index % p->across * p->width, end = gsf__least(begin + p->width, p->total);
+    const int64_t depth = job->plan.depth, first = (int64_t)index / p->across * depth;
+    const int64_t last = p->turned ? gsf__least(first + depth, job->length) : job->length;
     (void)worker;
-    for (int64_t k = 0; k < job->length; k += job->plan.depth) {
-        const int64_t count = gsf__least(job->length - k, job->plan.depth);
-        for (int64_t at = first; at < end; at += GSF__TILE_COLUMNS)
-            gsf__pack_panel(job, job->first + at, job->columns - at, k, count,
-                            gsf__packed_panel(job, at, k, gsf__round_up(count, job->kernels->step)));
+    for (int64_t k = first; k < last; k += depth) {
+        const int64_t count = gsf__least(last - k, depth), padded = gsf__round_up(count, job->kernels->step);
+        const int64_t piece = p->turned ? (int64_t)GSF__PACK_STEPS : count;
+        for (int64_t i = 0; i < count; i += piece)
+            for (int64_t at = begin, some = gsf__least(count - i, piece); at < end; at += p->strip) {
+                if (p->of_x) gsf__pack_group(job, job->first_row + at, end - at, k + i, some,
+                                             gsf__packed_group(job, at, k, padded) + i * p->strip);
+                else gsf__pack_panel(job, job->first + at, end - at, k + i, some,
+                                     gsf__packed_panel(job, at, k, padded) + i * p->strip);
+            }
     }
+}
+
+static void gsf__run_packing(gsf_context* ctx, const gsf__linear_job* job, int of_x) {
+    const int turned = (of_x ? job->desc.transposed_x : job->desc.transposed_weight) != 0;
+    const int64_t strip = of_x ? job->kernels->height : (int64_t)GSF__TILE_COLUMNS, total = of_x ? job->rows : job->columns;
+    const int64_t width = strip * (turned ? (int64_t)GSF__PACK_STRIPS : 1), across = gsf__ceil_div(total, width);
+    gsf__linear_packing packing = {job, of_x, turned, strip, width, total, across};
+    gsf__parallel_for(ctx, (size_t)(across * (turned ? gsf__ceil_div(job->length, job->plan.depth) : 1)), gsf__linear_pack,
+                      &packing);
 }
 
 // All tiles of one or two panels at one step of `count` packed values; `next` is the distance between the sums of the two.
 static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t next,
-                               int64_t k, int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
+                               int64_t panels, int64_t groups, int64_t count, int add) {
     const gsf__linear_kernels* kernels = job->kernels;
     const int64_t height = kernels->height, tile = height * GSF__TILE_COLUMNS;
-    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, height);
     const float* ahead = w + panels * count * GSF__TILE_COLUMNS; // usually the panels after these
     const int64_t share = job->plan.lone ? 0 : gsf__round_up(gsf__ceil_div(panels * count * GSF__TILE_COLUMNS, groups), 16);
     for (int64_t g = 0, step; g < groups; g += step) {
         const float* a = x + g * height * count;
         float* s = sums + g * tile;
         step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
-        if (step == 2) kernels->four_tiles(a, w, count, k > 0, s, next, ahead + g * share, 2 * share);
+        if (step == 2) kernels->four_tiles(a, w, count, add, s, next, ahead + g * share, 2 * share);
         for (int64_t p = 0; step == 1 && p < panels; p++)
-            kernels->tile(a, w + p * count * GSF__TILE_COLUMNS, count, k > 0, s + p * next, ahead + g * share,
+            kernels->tile(a, w + p * count * GSF__TILE_COLUMNS, count, add, s + p * next, ahead + g * share,
                           p == 0 ? share : 0);
-        if (k + count < job->length) continue;
-        for (int64_t t = 0; t < step * panels; t++) {
-            const int64_t p = t / step, r = (g + t % step) * height, c = p * GSF__TILE_COLUMNS;
-            kernels->epilogue(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
-                              gsf__least(rows - r, height), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
-        }
     }
 }
 
@@ -4808,27 +4837,35 @@ static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a bl
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf__linear_plan* plan = &job->plan;
     const gsf__linear_kernels* kernels = job->kernels;
-    const int64_t row = (int64_t)index % plan->row_blocks * plan->block_rows;
-    const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // within the group
-    const int64_t rows = gsf__least(job->desc.rows - row, plan->block_rows);
+    const int64_t row_blocks = gsf__ceil_div(job->rows, plan->block_rows), row = (int64_t)index % row_blocks * plan->block_rows;
+    const int64_t at = (int64_t)index / row_blocks * plan->block_columns; // within the group, as `row`
+    const int64_t rows = gsf__least(job->rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
     const int64_t groups = gsf__ceil_div(rows, kernels->height), next = groups * kernels->height * GSF__TILE_COLUMNS;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both are padded to whole tiles
-    float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
+    float* own_x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
     if (kernels->enter) kernels->enter();
     for (int64_t k = 0; k < job->length; k += plan->depth) {
         const int64_t count = gsf__least(job->length - k, plan->depth), padded = gsf__round_up(count, kernels->step);
-        for (int64_t r = 0; r < rows; r += kernels->height) gsf__pack_group(job, row + r, rows - r, k, count, x + r * padded);
+        const float* x = plan->shares_x ? gsf__packed_group(job, row, k, padded) : own_x;
+        for (int64_t r = 0; !plan->shares_x && r < rows; r += kernels->height)
+            gsf__pack_group(job, job->first_row + row + r, rows - r, k, count, own_x + r * padded);
         for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
-            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), column = job->first + at + c;
+            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR);
             const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, padded);
             for (int64_t p = 0; plan->lone && p < width; p += GSF__TILE_COLUMNS)
-                gsf__pack_panel(job, column + p, width - p, k, count, panel + p * padded);
-            gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, padded, row, rows, column, width);
+                gsf__pack_panel(job, job->first + at + c + p, width - p, k, count, panel + p * padded);
+            gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, gsf__ceil_div(width, GSF__TILE_COLUMNS),
+                               groups, padded, k > 0);
         }
     }
     if (kernels->leave) kernels->leave();
+    for (int64_t r = 0; r < rows; r += kernels->height) // along the rows of y
+        for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS)
+            kernels->epilogue(job, sums + c / GSF__TILE_COLUMNS * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS,
+                              job->first_row + row + r, gsf__least(rows - r, kernels->height), job->first + at + c,
+                              gsf__least(columns - c, GSF__TILE_COLUMNS));
 }
 
 static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some outputs, all rows
@@ -4869,15 +4906,18 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
         plan->depth = gsf__even_piece(in, kernels->depth, kernels->step > 8 ? kernels->step : 8);
         const int64_t highest = plan->lone ? (int64_t)GSF__LINEAR_LONE_ROWS : kernels->rows;
         plan->block_rows = gsf__even_piece(rows, highest, 2 * kernels->height);
-        plan->row_blocks = gsf__ceil_div(rows, plan->block_rows);
         const int64_t most = GSF__LINEAR_PACKED / in / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
         const int64_t widest = plan->lone ? (int64_t)GSF__LINEAR_LONE_COLUMNS : kernels->columns;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
-        const int64_t packed = gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS);
+        plan->shares_x = kernels->shares_x && plan->block_columns < out;
+        const int64_t fit = most / plan->block_rows * plan->block_rows; // whole blocks
+        plan->group_rows = plan->shares_x ? gsf__even_piece(rows, fit > 0 ? fit : plan->block_rows, plan->block_rows) : rows;
+        const int64_t x_rows = plan->shares_x ? gsf__round_up(gsf__least(rows, plan->group_rows), kernels->height) : 0;
+        const int64_t strips = (plan->lone ? 0 : gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS)) + x_rows;
         if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__LINEAR_PAIR);
-        else if (!gsf__mul_size((size_t)packed, (size_t)gsf__round_up(in, kernels->step), &shared)) return 0;
+        if (!gsf__mul_size((size_t)strips, (size_t)gsf__round_up(in, kernels->step), &shared)) return 0;
     }
     plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers start on cache lines
     plan->shared = shared + (size_t)gsf__round_up(out + 16, 16);
@@ -4907,6 +4947,8 @@ static gsf_result gsf__check_linear(gsf_context* ctx, const gsf__nn_linear_desc*
 
 static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch is allocated already
     const gsf__linear_plan* plan = &job->plan;
+    const int64_t packed = plan->lone ? 0 : gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS);
+    job->packed_x = job->packed + packed * gsf__round_up(job->length, job->kernels->step);
     memset(job->bias, 0, (size_t)(job->out + 16) * sizeof(float));
     if (job->desc.bias) gsf_nn_convert_tensor(job->desc.bias, 0, job->out, job->bias);
     if (plan->gemv) {
@@ -4916,11 +4958,14 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     }
     for (job->first = 0; job->first < job->out; job->first += plan->group_columns) {
         job->columns = gsf__least(job->out - job->first, plan->group_columns);
-        if (!plan->lone)
-            gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->columns, gsf__linear_packed_at_once(job)),
-                              gsf__linear_pack_panels, job);
-        const int64_t blocks = plan->row_blocks * gsf__ceil_div(job->columns, plan->block_columns);
-        gsf__parallel_for(ctx, (size_t)blocks, gsf__linear_block, job);
+        if (!plan->lone) gsf__run_packing(ctx, job, 0);
+        for (job->first_row = 0; job->first_row < job->desc.rows; job->first_row += plan->group_rows) {
+            job->rows = gsf__least(job->desc.rows - job->first_row, plan->group_rows);
+            const int kept = job->first > 0 && plan->group_rows >= job->desc.rows; // there since the first outputs
+            if (plan->shares_x && !kept) gsf__run_packing(ctx, job, 1);
+            const int64_t down = gsf__ceil_div(job->rows, plan->block_rows);
+            gsf__parallel_for(ctx, (size_t)(down * gsf__ceil_div(job->columns, plan->block_columns)), gsf__linear_block, job);
+        }
     }
 }
 
@@ -19587,8 +19632,7 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* 
 /* FlashAttention-2's backward pass (Dao 2023): per head and block of keys, blocks of queries recompute the weights from the
    logits and the forward pass's lse. With p = softmax(s), s the logits:
        dp = dy v^T    ds = p (dp - sum(p dp)) = p (dp - dy out^T)    dv += p^T dy    dq += scale ds k    dk += scale ds^T q
-   All five products are gsf__grad_product of blocks that stay in cache, with bf16 and AMX as tiles. A unit of work is one
-   head. */
+   All five products are of blocks that stay in cache, with bf16 and AMX as tiles. A unit of work is one head. */
 enum { GSF__ATT_GRAD_KEYS = 128, GSF__ATT_GRAD_QUERIES = 96 }; // per block; queries: a multiple of 6
 
 typedef struct gsf__nn_attention_grad_desc {
@@ -19597,7 +19641,10 @@ typedef struct gsf__nn_attention_grad_desc {
     float *dq, *dk, *dv;    // (queries or keys, heads*head_dim)
 } gsf__nn_attention_grad_desc;
 
-typedef struct gsf__attention_grad_job {
+typedef struct gsf__attention_grad_job gsf__attention_grad_job;
+typedef struct gsf__attention_grad_blocks gsf__attention_grad_blocks;
+
+struct gsf__attention_grad_job {
     gsf__nn_attention_desc desc; // with its defaults filled in
     const gsf__nn_attention_grad_desc* grad;
     const gsf__grad_kernels* kernels;
@@ -19605,29 +19652,37 @@ typedef struct gsf__attention_grad_job {
     size_t scratch_floats;       // per worker
     int64_t pitch;               // of rows of head_dim values in scratch
     int tiles;                   // products of bf16 by AMX
-} gsf__attention_grad_job;
+    // Fills b->k_across, v_across and k_pairs from b->k, of which there are `keys`, and v
+    void (*prepare_keys)(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t column, int64_t key,
+                         int64_t keys);
+    // Queries `first` ... of a head against the block of `keys` keys
+    void (*run_block)(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t head, int64_t first,
+                      int64_t keys);
+};
 
 // Row stride of a block: an odd number of cache lines, so that the rows do not compete for the same cache sets.
 static int64_t gsf__grad_pitch(int64_t columns) { return (gsf__ceil_div(columns, 16) | 1) * 16; }
 
 enum { GSF__ATT_GRAD_PITCH = GSF__ATT_GRAD_KEYS + 16 };
 
-typedef struct gsf__attention_grad_blocks { // of one worker
+struct gsf__attention_grad_blocks { // of one worker
     float *q, *dy;           // (queries, dim), rows `pitch` apart
     float *k, *dk, *dv;      // (keys, dim)
-    float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart
+    float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart; with tiles packed, as k_pairs (keys, dim)
     float *p, *dp;           // (queries, keys)
     float *center, *delta;   // (dim); (queries): dy out^T
-    float* packed;           // both operands of a product, with tiles
-} gsf__attention_grad_blocks;
+    float *k_pairs, *packed, *packed_w; // with tiles; the latter two: operands of one product
+};
 
 // Divides the memory of a worker; returns the floats needed.
 static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, float* memory,
                                           gsf__attention_grad_blocks* b) {
-    const size_t pitch = (size_t)job->pitch, across = (size_t)job->desc.head_dim * GSF__ATT_GRAD_PITCH;
+    const size_t pitch = (size_t)job->pitch, dim = (size_t)gsf__round_up(job->desc.head_dim, 32), tiles = job->tiles ? 1 : 0;
+    const size_t across = tiles ? GSF__ATT_GRAD_KEYS * dim / 2 : (size_t)job->desc.head_dim * GSF__ATT_GRAD_PITCH;
+    const size_t longest = dim > GSF__ATT_GRAD_KEYS ? dim : (size_t)GSF__ATT_GRAD_KEYS;
     gsf__nn_arena arena = {memory, 0};
-    b->q = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * pitch);
-    b->dy = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * pitch);
+    b->q = gsf__nn_share(&arena, tiles ? 0 : GSF__ATT_GRAD_QUERIES * pitch);
+    b->dy = gsf__nn_share(&arena, tiles ? 0 : GSF__ATT_GRAD_QUERIES * pitch);
     b->k = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->dk = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->dv = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
@@ -19637,8 +19692,9 @@ static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, fl
     b->dp = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->center = gsf__nn_share(&arena, pitch);
     b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
-    const int64_t longest = gsf__round_up(job->desc.head_dim, 32) + GSF__ATT_GRAD_KEYS;
-    b->packed = gsf__nn_share(&arena, job->tiles ? (size_t)(longest * longest) : 0);
+    b->k_pairs = gsf__nn_share(&arena, tiles * dim * GSF__ATT_GRAD_KEYS / 2);
+    b->packed = gsf__nn_share(&arena, tiles * GSF__ATT_GRAD_KEYS * longest / 2);
+    b->packed_w = gsf__nn_share(&arena, tiles * dim * GSF__ATT_GRAD_QUERIES / 2);
     return arena.used;
 }
 
@@ -19647,57 +19703,15 @@ static void gsf__attention_grad_copy(const float* from, int64_t ld, int64_t rows
     for (int64_t r = 0; r < rows; r++) memcpy(to + r * pitch, from + r * ld, (size_t)dim * sizeof(float));
 }
 
-#if GSF__AMX
-// A product by tiles of bf16: a_row or a_step is 1. Whole tiles of c are updated in place.
-GSF__TARGET_AMX static void gsf__multiply_amx(const gsf__grad_product* p, float* packed) {
-    const int64_t groups = gsf__ceil_div(p->rows, GSF__AMX_ROWS), panels = gsf__ceil_div(p->columns, 16);
-    const int64_t tiles = gsf__ceil_div(p->count, 32), size = tiles * GSF__AMX_TILE;
-    float* const b = packed + groups * size;
-    for (int64_t g = 0; g < groups; g++) {
-        const int64_t row = g * GSF__AMX_ROWS, rows = gsf__least(p->rows - row, GSF__AMX_ROWS);
-        if (p->a_step == 1) gsf__pack_rows_amx(p->a + row * p->a_row, p->a_row, rows, p->count, packed + g * size);
-        else gsf__pack_columns_amx(p->a + row, p->a_step, rows, p->count, packed + g * size);
-    }
-    for (int64_t j = 0; j < panels; j++)
-        gsf__pack_transposed_bf16((const char*)(p->b + 16 * j), GSF_NN_F32, (size_t)p->ldb * sizeof(float),
-                                  gsf__least(p->columns - 16 * j, 16), p->count, b + j * size);
-    for (int64_t g = 0; g < groups; g++)
-        for (int64_t j = 0; j < panels; j++) {
-            const int64_t row = g * GSF__AMX_ROWS, rows = gsf__least(p->rows - row, GSF__AMX_ROWS);
-            const int64_t columns = gsf__least(p->columns - 16 * j, 16);
-            const int whole = rows == GSF__AMX_ROWS && columns == 16;
-            const float *x = packed + g * size, *w = b + j * size;
-            float edge[GSF__AMX_TILE], *c = p->c + row * p->ldc + 16 * j, *to = whole ? c : edge;
-            const int64_t pitch = whole ? 4 * p->ldc : 64;
-            for (int64_t r = 0; !whole && r < rows; r++) memcpy(edge + 16 * r, c + r * p->ldc, (size_t)columns * sizeof *c);
-            GSF__AMX_FENCE
-            _tile_loadd(0, to, pitch);
-            for (int64_t k = 0; k < tiles; k++) {
-                _tile_loadd(4, x + k * GSF__AMX_TILE, 64);
-                _tile_loadd(6, w + k * GSF__AMX_TILE, 64);
-                _tile_dpbf16ps(0, 4, 6);
-            }
-            _tile_stored(0, to, pitch);
-            GSF__AMX_FENCE
-            for (int64_t r = 0; !whole && r < rows; r++) memcpy(c + r * p->ldc, edge + 16 * r, (size_t)columns * sizeof *c);
-        }
-}
-#endif
-
 // c = a b or, with `add`, c += a b
-static void gsf__attention_grad_multiply(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* blocks,
-                                         const float* a, int64_t a_row, int64_t a_step, int64_t rows, const float* b,
-                                         int64_t ldb, int64_t count, int64_t columns, float* c, int64_t ldc, int add) {
+static void gsf__attention_grad_multiply(const gsf__attention_grad_job* job, const float* a, int64_t a_row, int64_t a_step,
+                                         int64_t rows, const float* b, int64_t ldb, int64_t count, int64_t columns, float* c,
+                                         int64_t ldc, int add) {
     const gsf__grad_product product = {a, b, c, a_row, a_step, ldb, ldc, rows, columns, count};
     for (int64_t r = 0; r < rows && !add; r++) memset(c + r * ldc, 0, (size_t)columns * sizeof(float));
-#if GSF__AMX
-    if (job->tiles) gsf__multiply_amx(&product, blocks->packed);
-#endif
-    (void)blocks;
-    if (!job->tiles) job->kernels->multiply(&product);
+    job->kernels->multiply(&product);
 }
 
-// Queries `first` ... of a head against the block of `keys` keys.
 static void gsf__attention_grad_block(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t head,
                                       int64_t first, int64_t keys) {
     const gsf__nn_attention_desc* d = &job->desc;
@@ -19706,16 +19720,116 @@ static void gsf__attention_grad_block(const gsf__attention_grad_job* job, const 
     const float *lse = d->lse + head * d->queries + first, *delta = b->delta + first;
     gsf__attention_grad_copy(d->q + first * d->ldq + column, d->ldq, queries, dim, pitch, b->q);
     gsf__attention_grad_copy(job->grad->dy + first * width + column, width, queries, dim, pitch, b->dy);
-    gsf__attention_grad_multiply(job, b, b->q, pitch, 1, queries, b->k_across, across, dim, keys, b->p, across, 0);
-    gsf__attention_grad_multiply(job, b, b->dy, pitch, 1, queries, b->v_across, across, dim, keys, b->dp, across, 0);
+    gsf__attention_grad_multiply(job, b->q, pitch, 1, queries, b->k_across, across, dim, keys, b->p, across, 0);
+    gsf__attention_grad_multiply(job, b->dy, pitch, 1, queries, b->v_across, across, dim, keys, b->dp, across, 0);
     for (int64_t r = 0; r < queries; r++)
         job->kernels->attention(b->p + r * across, b->dp + r * across, keys, d->scale * 1.44269504f, d->scale, lse[r],
                                 delta[r]);
-    gsf__attention_grad_multiply(job, b, b->p, 1, across, keys, b->dy, pitch, queries, dim, b->dv, pitch, 1);
-    gsf__attention_grad_multiply(job, b, b->dp, 1, across, keys, b->q, pitch, queries, dim, b->dk, pitch, 1);
-    gsf__attention_grad_multiply(job, b, b->dp, across, 1, queries, b->k, pitch, keys, dim,
+    gsf__attention_grad_multiply(job, b->p, 1, across, keys, b->dy, pitch, queries, dim, b->dv, pitch, 1);
+    gsf__attention_grad_multiply(job, b->dp, 1, across, keys, b->q, pitch, queries, dim, b->dk, pitch, 1);
+    gsf__attention_grad_multiply(job, b->dp, across, 1, queries, b->k, pitch, keys, dim,
                                  job->grad->dq + first * width + column, width, 1);
 }
+
+static void gsf__attention_grad_keys(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t column,
+                                     int64_t key, int64_t keys) {
+    const gsf__nn_attention_desc* d = &job->desc;
+    for (int64_t j = 0; j < keys; j++) {
+        const float *k = b->k + j * job->pitch, *v = d->v + (key + j) * d->ldv + column;
+        for (int64_t i = 0; i < d->head_dim; i++) {
+            b->k_across[i * GSF__ATT_GRAD_PITCH + j] = k[i];
+            b->v_across[i * GSF__ATT_GRAD_PITCH + j] = v[i];
+        }
+    }
+}
+
+#if GSF__AMX
+
+// Operands as groups and panels of tiles of bf16, as in >>nn linear. From rows, or from columns with their rows ld apart:
+GSF__TARGET_BF16 static void gsf__groups_along(const float* x, int64_t ld, int64_t rows, int64_t count, float* out) {
+    for (int64_t r = 0; r < rows; r += GSF__AMX_ROWS, out += GSF__AMX_ROWS * gsf__round_up(count, 32) / 2)
+        gsf__pack_rows_amx(x + r * ld, ld, gsf__least(rows - r, GSF__AMX_ROWS), count, out);
+}
+
+GSF__TARGET_BF16 static void gsf__groups_across(const float* x, int64_t ld, int64_t rows, int64_t count, float* out) {
+    for (int64_t r = 0; r < rows; r += GSF__AMX_ROWS, out += GSF__AMX_ROWS * gsf__round_up(count, 32) / 2)
+        gsf__pack_columns_amx(x + r, ld, gsf__least(rows - r, GSF__AMX_ROWS), count, out);
+}
+
+GSF__TARGET_BF16 static void gsf__panels_along(const float* x, int64_t ld, int64_t columns, int64_t count, float* out) {
+    const size_t pitch = (size_t)ld * sizeof *x;
+    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
+        gsf__pack_weights_bf16((const char*)(x + c * ld), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
+}
+
+GSF__TARGET_BF16 static void gsf__panels_across(const float* x, int64_t ld, int64_t columns, int64_t count, float* out) {
+    const size_t pitch = (size_t)ld * sizeof *x;
+    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
+        gsf__pack_transposed_bf16((const char*)(x + c), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
+}
+
+// c = a b or, with `add`, c += a b, of packed operands; tiles at the edges of c go through `edge`.
+GSF__TARGET_AMX static void gsf__multiply_amx(const float* a, int64_t rows, const float* b, int64_t count, int64_t columns,
+                                              float* c, int64_t ldc, int add) {
+    const int64_t tiles = gsf__ceil_div(count, 32), size = tiles * GSF__AMX_TILE;
+    for (int64_t row = 0; row < rows; row += GSF__AMX_ROWS, a += size)
+        for (int64_t column = 0; column < columns; column += 16) {
+            const int64_t height = gsf__least(rows - row, GSF__AMX_ROWS), width = gsf__least(columns - column, 16);
+            const float* w = b + column / 16 * size;
+            const int whole = height == GSF__AMX_ROWS && width == 16;
+            float edge[GSF__AMX_TILE], *to = c + row * ldc + column, *sums = whole ? to : edge;
+            const int64_t pitch = whole ? 4 * ldc : 64;
+            for (int64_t r = 0; add && !whole && r < height; r++)
+                memcpy(edge + 16 * r, to + r * ldc, (size_t)width * sizeof *c);
+            GSF__AMX_FENCE
+            if (add) _tile_loadd(0, sums, pitch);
+            else _tile_zero(0);
+            for (int64_t k = 0; k < tiles; k++) {
+                _tile_loadd(4, a + k * GSF__AMX_TILE, 64);
+                _tile_loadd(6, w + k * GSF__AMX_TILE, 64);
+                _tile_dpbf16ps(0, 4, 6);
+            }
+            _tile_stored(0, sums, pitch);
+            GSF__AMX_FENCE
+            for (int64_t r = 0; !whole && r < height; r++) memcpy(to + r * ldc, edge + 16 * r, (size_t)width * sizeof *c);
+        }
+}
+
+// As gsf__attention_grad_block, by tiles
+static void gsf__attention_grad_block_amx(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t head,
+                                          int64_t first, int64_t keys) {
+    const gsf__nn_attention_desc* d = &job->desc;
+    const int64_t dim = d->head_dim, width = d->heads * dim, column = head * dim, across = GSF__ATT_GRAD_PITCH;
+    const int64_t queries = gsf__least(GSF__ATT_GRAD_QUERIES, d->queries - first), pitch = job->pitch;
+    const float *q = d->q + first * d->ldq + column, *dy = job->grad->dy + first * width + column;
+    const float *lse = d->lse + head * d->queries + first, *delta = b->delta + first;
+    float *x = b->packed, *w = b->packed_w;
+    gsf__groups_along(q, d->ldq, queries, dim, x);
+    gsf__multiply_amx(x, queries, b->k_across, dim, keys, b->p, across, 0);
+    gsf__groups_along(dy, width, queries, dim, x);
+    gsf__multiply_amx(x, queries, b->v_across, dim, keys, b->dp, across, 0);
+    for (int64_t r = 0; r < queries; r++)
+        job->kernels->attention(b->p + r * across, b->dp + r * across, keys, d->scale * 1.44269504f, d->scale, lse[r],
+                                delta[r]);
+    gsf__groups_across(b->p, across, keys, queries, x);
+    gsf__panels_across(dy, width, dim, queries, w);
+    gsf__multiply_amx(x, keys, w, queries, dim, b->dv, pitch, 1);
+    gsf__groups_across(b->dp, across, keys, queries, x);
+    gsf__panels_across(q, d->ldq, dim, queries, w);
+    gsf__multiply_amx(x, keys, w, queries, dim, b->dk, pitch, 1);
+    gsf__groups_along(b->dp, across, queries, keys, x);
+    gsf__multiply_amx(x, queries, b->k_pairs, keys, dim, job->grad->dq + first * width + column, width, 1);
+}
+
+static void gsf__attention_grad_keys_amx(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b,
+                                         int64_t column, int64_t key, int64_t keys) {
+    const gsf__nn_attention_desc* d = &job->desc;
+    gsf__panels_along(b->k, job->pitch, keys, d->head_dim, b->k_across);
+    gsf__panels_along(d->v + key * d->ldv + column, d->ldv, keys, d->head_dim, b->v_across);
+    gsf__panels_across(b->k, job->pitch, d->head_dim, keys, b->k_pairs);
+}
+
+#endif
 
 static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
     const gsf__attention_grad_job* job = (const gsf__attention_grad_job*)arg;
@@ -19736,17 +19850,14 @@ static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
     }
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_GRAD_KEYS) {
         const int64_t keys = gsf__least(GSF__ATT_GRAD_KEYS, d->keys - key);
-        for (int64_t j = 0; j < keys; j++) {
-            const float *k = d->k + (key + j) * d->ldk + column, *v = d->v + (key + j) * d->ldv + column;
-            for (int64_t i = 0; i < dim; i++) {
-                b.k[j * job->pitch + i] = b.k_across[i * GSF__ATT_GRAD_PITCH + j] = k[i] - b.center[i];
-                b.v_across[i * GSF__ATT_GRAD_PITCH + j] = v[i];
-            }
-        }
+        for (int64_t j = 0; j < keys; j++)
+            for (int64_t i = 0; i < dim; i++)
+                b.k[j * job->pitch + i] = d->k[(key + j) * d->ldk + column + i] - b.center[i];
+        job->prepare_keys(job, &b, column, key, keys);
         memset(b.dk, 0, (size_t)(keys * job->pitch) * sizeof(float));
         memset(b.dv, 0, (size_t)(keys * job->pitch) * sizeof(float));
         for (int64_t first = 0; first < d->queries; first += GSF__ATT_GRAD_QUERIES)
-            gsf__attention_grad_block(job, &b, head, first, keys);
+            job->run_block(job, &b, head, first, keys);
         gsf__attention_grad_copy(b.dk, job->pitch, keys, dim, width, job->grad->dk + key * width + column);
         gsf__attention_grad_copy(b.dv, job->pitch, keys, dim, width, job->grad->dv + key * width + column);
     }
@@ -19769,8 +19880,14 @@ GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_at
     gsf__attention_fill_in(d);
     job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
     job.pitch = gsf__grad_pitch(d->head_dim);
+    job.prepare_keys = gsf__attention_grad_keys;
+    job.run_block = gsf__attention_grad_block;
 #if GSF__AMX
     job.tiles = d->bf16 && GSF__REACHES(ctx->cpu_level, AMX);
+    if (job.tiles) {
+        job.prepare_keys = gsf__attention_grad_keys_amx;
+        job.run_block = gsf__attention_grad_block_amx;
+    }
 #endif
     job.scratch_floats = gsf__attention_grad_lay_out(&job, NULL, &blocks);
     if (!gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &count))

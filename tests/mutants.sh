@@ -55,7 +55,7 @@ gsfixer_nn.h|test_nn_training|gradients: the mean of a norm is taken as constant
 gsfixer_nn.h|test_nn_training|gradients: a norm's scale without its bias|s/weight \* product \+ bias \* sum\)/weight * product)/
 gsfixer_nn.h|test_nn_training|gradients: rows of x taken without their stride|s/multiply\.ldw = d->ldx;/multiply.ldw = 0;/
 gsfixer_nn.h|test_nn_training|gradients: GELU without the density|s/gsf__v_madd\(gsf__v_with_sign\(z, x\), power \* gsf__v_set\(0\.398942280f\), below\)/below/
-gsfixer_nn.h|test_nn_training|gradients: attention's keys across blocks not centred alike|s/(b\.k\[j \* job->pitch \+ i\] = b\.k_across\[[^=]*= k\[i\]) - b\.center\[i\]/$1/
+gsfixer_nn.h|test_nn_training|gradients: attention's keys across blocks not centred alike|s/(b\.k\[j \* job->pitch \+ i\] = d->k\[[^;]*\]) - b\.center\[i\]/$1/
 gsfixer_nn.h|test_nn_gradients|gradients: the rotary embedding turned on instead of back|s/(gsf__v_turn_pairs\(d, gsf__v_load_first\(cos \+ i, left\)), zero - (gsf__v_load_first\(sin \+ i, left\)\))/$1, $2/
 gsfixer_nn.h|test_nn_gradients|gradients: group norm without its slope|s/n\.inverse \* gsf__v_nmadd\(normal, slope, h\)/n.inverse * h/
 gsfixer_nn.h|test_nn_gradients|gradients: convolution kernels not mirrored|s/\+ o\) \* taps \+ gsf__conv_flip\(t, layer->kernel\)/+ o) * taps + t/

@@ -309,8 +309,8 @@ int main(void) {
         test_attention(&ctx, 193, 257, 1, 64, 0.0, 1);
         test_attention(&ctx, 50, 35, 2, 32, 4.0, 1);
         test_attention(&ctx, 100, 131, 1, 17, 0.0, 1);
-        static const int64_t linear[][3] = {{3, 40, 19},   {5, 33, 19},  {67, 40, 130},
-                                            {200, 65, 48}, {333, 15, 3}, {31, 600, 70}};
+        static const int64_t linear[][3] = {{3, 40, 19},   {5, 33, 19},  {67, 40, 130},   {200, 65, 48},
+                                            {333, 15, 3}, {31, 600, 70}, {330, 1100, 270}, {270, 1090, 340}};
         for (size_t i = 0; i < GSF__COUNT(linear); i++) test_bf16_linear(&ctx, linear[i][0], linear[i][1], linear[i][2]);
     }
     test_layer_memory();
