@@ -391,7 +391,8 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
     gsf_nn_weights weights;
     int32_t bf16;                                           // the `bf16` member of its linear layers and attention, for
                                                             // speed: see GSF_CPU_AVX512_BF16 and AMX; in training, all
-                                                            // products (GSF__NN_BF16_ALL). May be changed at any time
+                                                            // products (GSF__NN_BF16_ALL), and the blocks' inputs are
+                                                            // kept in bfloat16. May be changed at any time
     void* nets;                                             // private
 } gsf_nn_transformer;
 
@@ -20770,7 +20771,7 @@ GSF__SHARED gsf_result gsf__nn_load_params(gsf_context* ctx, gsf__nn_params* par
 
 /* Gradients of gsf_nn_run_transformer, one sample at a time. The forward pass keeps the input of every block; the backward
    pass runs a block again, keeping its intermediates, and then backwards. So the memory is that of one block plus one
-   (tokens, width) per block. Names: d* is the gradient of *. */
+   (tokens, width) per block, with bf16 in bfloat16. Names: d* is the gradient of *. */
 
 typedef struct gsf__dit_trace { // intermediates of one block; (tokens, width) unless noted, q, k: before their norms
     float *m1, *m2;                        // (6 width): modulation
@@ -20785,7 +20786,7 @@ typedef struct gsf__dit_train {
     gsf__nn_params* params;
     const gsf__lora* lora;     // NULL, or the adapters that `params` are of
     const float *dino, *vggt;  // the sample's reference tokens, before the projection
-    float* inputs;             // (layers + 1, tokens, width): x before each block and after the last
+    float* inputs;             // (layers + 1, tokens, width): x before each block and after the last; with bf16 in bfloat16
     float* references;         // (reference tokens, width)
     gsf__dit_trace kept;
     float *dx, *dn, *db, *dq, *dk, *dv; // (rows, width), rows: the larger of tokens and reference tokens
@@ -21127,7 +21128,8 @@ static size_t gsf__dit_lay_out_train(gsf__dit_train* t, float* memory) {
     s->m1 = gsf__nn_share(&arena, 6 * d);
     s->m2 = gsf__nn_share(&arena, 6 * d);
     t->dm = gsf__nn_share(&arena, 6 * d);
-    t->inputs = gsf__nn_share(&arena, gsf__nn_product((size_t)c->layers + 1, n * d));
+    const size_t kept = gsf__nn_product((size_t)c->layers + 1, n * d);
+    t->inputs = gsf__nn_share(&arena, t->run.nn.bf16 ? kept / 2 + kept % 2 : kept);
     t->patches = gsf__nn_share(&arena, video * (size_t)c->patch * (size_t)c->patch * channels);
     t->out = gsf__nn_share(&arena, 3 * video * (size_t)c->patch * (size_t)c->patch * channels);
     t->wave = gsf__nn_share(&arena, d);
@@ -21149,6 +21151,40 @@ static void gsf__dit_join_input(const gsf__dit_train* t, const float* noisy, con
     }
 }
 
+typedef struct gsf__dit_keeping { // of an input in bfloat16, or back
+    float* x;
+    uint16_t* kept;
+    int64_t count;
+    int back;
+} gsf__dit_keeping;
+
+enum { GSF__DIT_KEEPING = 1 << 16 }; // values per chunk
+
+static void gsf__dit_keep_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__dit_keeping* k = (const gsf__dit_keeping*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__DIT_KEEPING, end = gsf__least(begin + GSF__DIT_KEEPING, k->count);
+    (void)worker;
+    for (int64_t i = begin; i < end && !k->back; i++) k->kept[i] = gsf__float_to_bf16(k->x[i]);
+    for (int64_t i = begin; i < end && k->back; i++) k->x[i] = gsf__bf16_to_float(k->kept[i]);
+}
+
+// run->x as input `index`.
+static void gsf__dit_keep_input(const gsf__dit_train* t, int32_t index) {
+    const int64_t rows = t->run.tokens * t->run.width, at = index * rows;
+    gsf__dit_keeping keeping = {t->run.x, (uint16_t*)t->inputs + at, rows, 0};
+    if (t->run.nn.bf16) gsf__parallel_for(t->run.nn.ctx, gsf__nn_chunks(rows, GSF__DIT_KEEPING), gsf__dit_keep_chunk, &keeping);
+    else memcpy(t->inputs + at, t->run.x, (size_t)rows * sizeof(float));
+}
+
+// Input `index`, until the next call: with bf16 in run->x.
+static float* gsf__dit_kept_input(const gsf__dit_train* t, int32_t index) {
+    const int64_t rows = t->run.tokens * t->run.width, at = index * rows;
+    gsf__dit_keeping keeping = {t->run.x, (uint16_t*)t->inputs + at, rows, 1};
+    if (!t->run.nn.bf16) return t->inputs + at;
+    gsf__parallel_for(t->run.nn.ctx, gsf__nn_chunks(rows, GSF__DIT_KEEPING), gsf__dit_keep_chunk, &keeping);
+    return t->run.x;
+}
+
 // Adds an example's squared error to *loss and its gradients, both times `share`.
 static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train_desc* desc, const gsf__dit_example* e,
                                          double share, float* predicted, double* loss) {
@@ -21156,7 +21192,6 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
     gsf_context* ctx = run->nn.ctx;
     const gsf_nn_transformer* c = run->net;
     const size_t count = (size_t)desc->frames * (size_t)c->out_channels * (size_t)desc->height * (size_t)desc->width;
-    const size_t rows = (size_t)(run->tokens * run->width);
     const size_t pixels = count / (size_t)c->out_channels;
     float *out = t->out, *hidden = out + count, *target = hidden + pixels * (size_t)c->in_channels;
     double sum = 0.0;
@@ -21169,10 +21204,10 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
     GSF__TRY(gsf__dit_embed_time(run));
     GSF__TRY(gsf__dit_embed(run));
     for (int32_t i = 0; i < c->layers; i++) {
-        memcpy(t->inputs + (size_t)i * rows, run->x, rows * sizeof(float));
+        gsf__dit_keep_input(t, i);
         GSF__TRY(gsf__dit_block_forward(run, i));
     }
-    memcpy(t->inputs + (size_t)c->layers * rows, run->x, rows * sizeof(float));
+    gsf__dit_keep_input(t, c->layers);
     GSF__TRY(gsf__dit_head(run, 0, out));
     GSF__TRY(gsf__nn_check(&run->nn, "the output layer", "proj_out.", out, (int64_t)count));
     if (predicted) memcpy(predicted, out, count * sizeof(float));
@@ -21185,9 +21220,9 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
     *loss += share * sum;
     memset(t->dtime, 0, (size_t)c->time_channels * sizeof(float));
     memset(t->dreferences, 0, (size_t)(e->reference_tokens * run->width) * sizeof(float));
-    GSF__TRY(gsf__dit_output_grad(t, t->inputs + (size_t)c->layers * rows, out));
+    GSF__TRY(gsf__dit_output_grad(t, gsf__dit_kept_input(t, c->layers), out));
     for (int32_t i = c->layers - 1; i >= 0; i--) {
-        float* x = t->inputs + (size_t)i * rows;
+        float* x = gsf__dit_kept_input(t, i);
         GSF__TRY(gsf__dit_trace_block(t, &run->nets->blocks[i], x));
         GSF__TRY(gsf__dit_block_backward(t, &run->nets->blocks[i], x));
         GSF__TRY(gsf__check_cancel(ctx));
@@ -21255,8 +21290,8 @@ GSF__SHARED gsf_result gsf__nn_train_transformer(gsf_context* ctx, const gsf_nn_
 }
 
 /* Memory of training in bytes. weights: parameters, gradients, Adam's moments and, if `average`, the moving average, all
-   float32. kept: the input of every block (checkpoints). work: one block's intermediates and gradients, with the transposes of
-   its largest layer. */
+   float32. kept: the input of every block (checkpoints), with bf16 in bfloat16. work: one block's intermediates and gradients,
+   with the transposes of its largest layer. */
 typedef struct gsf__dit_train_cost { double weights, kept, work; } gsf__dit_train_cost;
 
 // Of `trained` parameters and one example at a time of this size. Weights that are not trained stay in the mapped files.
@@ -21277,9 +21312,10 @@ GSF__SHARED gsf__dit_train_cost gsf__nn_query_training(gsf_context* ctx, const g
     in.references = &there;
     gsf__dit_begin_run(&t.run, ctx, transformer);
     gsf__dit_set_input(&t.run, &in);
+    t.run.nn.bf16 = transformer->bf16 ? GSF__NN_BF16_ALL : 0;
     const double d = (double)t.run.width, tokens = (double)t.run.tokens, floats = (double)gsf__dit_lay_out_train(&t, NULL);
     cost.weights = (average ? 20.0 : 16.0) * (double)trained;
-    cost.kept = 4.0 * ((double)transformer->layers + 1.0) * tokens * d;
+    cost.kept = (transformer->bf16 ? 2.0 : 4.0) * ((double)transformer->layers + 1.0) * tokens * d;
     cost.work = 4.0 * (floats + (5.0 * tokens * d > 4.0 * d * d ? 5.0 * tokens * d : 4.0 * d * d)) - cost.kept;
     return cost;
 }

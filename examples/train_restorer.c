@@ -22,7 +22,8 @@
    bytes, as do runs with other numbers of threads. Delete OUT/cache if the weights of MODEL_DIR's encoders change.
    OUT/training.loss.html shows the loss.
    --bf16: products of bfloat16, where the processor has them fast (AMX; AVX-512 of AMD since Zen 4): operands are rounded to
-   bfloat16, sums, weights, gradients and everything else stay float32, as does the memory needed.
+   bfloat16, sums, weights, gradients and everything else stay float32. On all processors the blocks' inputs, which are kept for
+   the way back, are rounded to it, too, and take half the memory.
    --memory: only print what training needs. With -DGSF_USE_MPI, compiled by mpicc, up to --groups ranks share each batch:
        mpirun -np 2 train_restorer ...
    writes the bytes of one rank (training.h). OUT is then on storage that all of them see. */
