@@ -5661,7 +5661,7 @@ static void gsf__int8_epilogue(const gsf__int8_job* job, const int32_t* sums, in
 
 // All tiles of one or two panels at one step, like gsf__linear_panels.
 static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows, int64_t column, int64_t columns, int64_t k,
-                             int64_t count, int32_t* sums, int64_t next, int16_t* panel, float* tile) {
+                             int64_t count, int32_t* sums, int64_t next, int16_t* panel) {
     const gsf__int8_kernels* kernels = job->kernels;
     const int64_t height = kernels->height, sum_count = height * GSF__TILE_COLUMNS;
     const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, height);
@@ -5684,13 +5684,6 @@ static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows
             if (kernels->widen) gsf__int8_fetch(ahead + p * panel_size + g * share, share);
             kernels->tile(x, b, count, k > 0, s + p * next);
         }
-        if (k + count < job->padded) continue;
-        for (int64_t t = 0; t < step * panels; t++) {
-            const int64_t p = t / step, down = t % step * height, c = p * GSF__TILE_COLUMNS;
-            gsf__int8_epilogue(job, s + p * next + t % step * sum_count, r + down,
-                               gsf__least(row + rows - r - down, height), column + c,
-                               gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
-        }
     }
 }
 
@@ -5712,11 +5705,14 @@ static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a bloc
             for (int64_t p = 0; job->kernels->widen && p < width; p += GSF__TILE_COLUMNS)
                 job->kernels->widen(job->weight->data + (column + c + p) * job->padded + k * GSF__TILE_COLUMNS, count,
                                     panel + p * count);
-            gsf__int8_panels(job, row, rows, column + c, width, k, count, sums + c / GSF__TILE_COLUMNS * next, next, panel,
-                             tile);
+            gsf__int8_panels(job, row, rows, column + c, width, k, count, sums + c / GSF__TILE_COLUMNS * next, next, panel);
         }
     }
     if (job->kernels->leave) job->kernels->leave();
+    for (int64_t r = 0; r < rows; r += height) // along the rows of y, as gsf__linear_block
+        for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS)
+            gsf__int8_epilogue(job, sums + c / GSF__TILE_COLUMNS * next + r * GSF__TILE_COLUMNS, row + r,
+                               gsf__least(rows - r, height), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
 }
 
 static void gsf__int8_gemv(void* arg, size_t index, int32_t worker) { // some panels of outputs, all rows
