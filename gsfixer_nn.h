@@ -3780,10 +3780,10 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 // held in registers. AVX-512 computes two groups by two panels at a time, 12 x 32 sums, on request with pairs of bf16
 // in the place of floats, AMX such pairs of groups of 16 rows. After the last step the block goes through bias, activation,
 // gate and residual into y, row by row: y is often larger than the caches. The weights are packed once per call for all blocks,
-// or, if one block covers all rows, by the worker that needs them; x by each block, or, where tiles are so fast that it would
-// show (AMX), once per call. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are not packed but
-// used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result does not depend
-// on the number of workers.
+// or, if one block covers all rows, by the worker that needs them; x by each block or, where it would show, once per call: if
+// it is stored transposed, and for tiles of bf16. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they
+// are not packed but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the
+// result does not depend on the number of workers.
 
 enum {
     GSF__TILE_ROWS = 6,
@@ -3842,7 +3842,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set; `count`: va
     int64_t height;    // rows of a group: 6 or, as tiles, 16
     int64_t step;      // packed values come in multiples of this, filled up with zeros
     int64_t depth, rows, columns; // of a block, at most
-    int shares_x;      // x is packed once for all blocks; pack_rows must not write beyond its group
+    int shares_x;      // x is packed once for all blocks, always; pack_rows must not write beyond its group
     void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__linear_kernels;
 
@@ -4892,7 +4892,7 @@ static void gsf__gemv_order(gsf__linear_job* job) {
 
 // Plans (rows, in) x (out, in)^T, `in` in units; returns 0 if the size of the scratch memory overflows.
 static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, int64_t in, int64_t out, size_t weight_size,
-                            int gemv, gsf__linear_plan* plan) {
+                            int gemv, int shares_x, gsf__linear_plan* plan) {
     memset(plan, 0, sizeof *plan);
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
     size_t shared = 0;
@@ -4912,7 +4912,7 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
-        plan->shares_x = kernels->shares_x && plan->block_columns < out;
+        plan->shares_x = shares_x && plan->block_columns < out;
         const int64_t fit = most / plan->block_rows * plan->block_rows; // whole blocks
         plan->group_rows = plan->shares_x ? gsf__even_piece(rows, fit > 0 ? fit : plan->block_rows, plan->block_rows) : rows;
         const int64_t x_rows = plan->shares_x ? gsf__round_up(gsf__least(rows, plan->group_rows), kernels->height) : 0;
@@ -4989,7 +4989,7 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
     job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !gemv);
     job.length = gsf__ceil_div(job.in, job.kernels->unit);
     if (!gsf__plan_linear(job.kernels, desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), gemv,
-                          &job.plan) ||
+                          desc->transposed_x || job.kernels->shares_x, &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
         floats > SIZE_MAX - job.plan.shared || !gsf__mul_size(floats + job.plan.shared, sizeof(float), &bytes))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows x %lld x %lld", (long long)desc->rows,
