@@ -4911,8 +4911,9 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
         const int64_t widest = plan->lone ? (int64_t)GSF__LINEAR_LONE_COLUMNS : kernels->columns;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
-        plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
         plan->shares_x = shares_x && plan->block_columns < out;
+        const int64_t own = plan->shares_x ? 0 : plan->depth;
+        plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + own) + GSF__TILE_COLUMNS);
         const int64_t fit = most / plan->block_rows * plan->block_rows; // whole blocks
         plan->group_rows = plan->shares_x ? gsf__even_piece(rows, fit > 0 ? fit : plan->block_rows, plan->block_rows) : rows;
         const int64_t x_rows = plan->shares_x ? gsf__round_up(gsf__least(rows, plan->group_rows), kernels->height) : 0;
@@ -20782,7 +20783,7 @@ typedef struct gsf__dit_train {
     gsf__nn_params* params;
     const gsf__lora* lora;     // NULL, or the adapters that `params` are of
     const float *dino, *vggt;  // the sample's reference tokens, before the projection
-    float* inputs;             // (layers + 1, tokens, width): x before each block and after the last; with bf16 in bfloat16
+    float* inputs;             // (layers, tokens, width): x before each block; with bf16 in bfloat16
     float* references;         // (reference tokens, width)
     gsf__dit_trace kept;
     float *dx, *dn, *db, *dq, *dk, *dv; // (rows, width), rows: the larger of tokens and reference tokens
@@ -21124,7 +21125,7 @@ static size_t gsf__dit_lay_out_train(gsf__dit_train* t, float* memory) {
     s->m1 = gsf__nn_share(&arena, 6 * d);
     s->m2 = gsf__nn_share(&arena, 6 * d);
     t->dm = gsf__nn_share(&arena, 6 * d);
-    const size_t kept = gsf__nn_product((size_t)c->layers + 1, n * d);
+    const size_t kept = gsf__nn_product((size_t)c->layers, n * d);
     t->inputs = gsf__nn_share(&arena, t->run.nn.bf16 ? kept / 2 + kept % 2 : kept);
     t->patches = gsf__nn_share(&arena, video * (size_t)c->patch * (size_t)c->patch * channels);
     t->out = gsf__nn_share(&arena, 3 * video * (size_t)c->patch * (size_t)c->patch * channels);
@@ -21203,7 +21204,6 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
         gsf__dit_keep_input(t, i);
         GSF__TRY(gsf__dit_block_forward(run, i));
     }
-    gsf__dit_keep_input(t, c->layers);
     GSF__TRY(gsf__dit_head(run, 0, out));
     GSF__TRY(gsf__nn_check(&run->nn, "the output layer", "proj_out.", out, (int64_t)count));
     if (predicted) memcpy(predicted, out, count * sizeof(float));
@@ -21216,7 +21216,7 @@ static gsf_result gsf__dit_train_example(gsf__dit_train* t, const gsf__dit_train
     *loss += share * sum;
     memset(t->dtime, 0, (size_t)c->time_channels * sizeof(float));
     memset(t->dreferences, 0, (size_t)(e->reference_tokens * run->width) * sizeof(float));
-    GSF__TRY(gsf__dit_output_grad(t, gsf__dit_kept_input(t, c->layers), out));
+    GSF__TRY(gsf__dit_output_grad(t, run->x, out)); // what the last block returned
     for (int32_t i = c->layers - 1; i >= 0; i--) {
         float* x = gsf__dit_kept_input(t, i);
         GSF__TRY(gsf__dit_trace_block(t, &run->nets->blocks[i], x));
@@ -21311,7 +21311,7 @@ GSF__SHARED gsf__dit_train_cost gsf__nn_query_training(gsf_context* ctx, const g
     t.run.nn.bf16 = transformer->bf16 ? GSF__NN_BF16_ALL : 0;
     const double d = (double)t.run.width, tokens = (double)t.run.tokens, floats = (double)gsf__dit_lay_out_train(&t, NULL);
     cost.weights = (average ? 20.0 : 16.0) * (double)trained;
-    cost.kept = (transformer->bf16 ? 2.0 : 4.0) * ((double)transformer->layers + 1.0) * tokens * d;
+    cost.kept = (transformer->bf16 ? 2.0 : 4.0) * (double)transformer->layers * tokens * d;
     cost.work = 4.0 * (floats + (5.0 * tokens * d > 4.0 * d * d ? 5.0 * tokens * d : 4.0 * d * d)) - cost.kept;
     return cost;
 }

@@ -557,6 +557,7 @@ static gsf_result open_model(training* t) {
     gsf_result result = gsf_nn_load_transformer(ctx, join(t->o.model, "transformer").text, &t->net);
     if (result == GSF_OK)
         result = gsf_nn_load_schedule(ctx, join(t->o.model, "scheduler/scheduler_config.json").text, &t->schedule);
+    t->net.bf16 = t->o.bf16;
     t->frames = (t->net.sample_frames - 1) / (t->net.temporal_ratio ? t->net.temporal_ratio : 1) + 1;
     t->height = t->net.sample_height;
     t->width = t->net.sample_width;

@@ -48,6 +48,12 @@ same whole threads "$weights" training.state training.loss.csv
 killed stopped "${full[@]}" --threads 2
 same whole stopped "$weights" training.state training.loss.csv training.loss.html
 
+# --bf16 rounds at least the inputs that are kept for the way back.
+run rounded "${full[@]}" --threads 1 --bf16
+run rounded2 "${full[@]}" --threads 3 --bf16
+same rounded rounded2 "$weights" training.state training.loss.csv
+cmp -s whole/training.state rounded/training.state && fail "--bf16 changes nothing"
+
 lora=(--iterations 12 --warmup 2 --lora 3 --alpha 6 --rate 1e-2)
 adapters=(adapter_model.safetensors adapter_config.json training.state training.loss.csv)
 run adapted "${lora[@]}" --threads 1
