@@ -654,6 +654,9 @@ typedef struct gsf_fix_desc {
                                   // prefers, or 1. Not used if the restorer has a frame size of its own (limits.squash)
     int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
                                   // accepts smaller ones; 0 = no limit
+    float auto_exposure;          // share of the exposure that the photos' camera would have chosen for a frame of
+                                  // gsf_splat_restore_views, if the photos show that it chose by what it saw and the restorer
+                                  // has photos carried; default 1; negative = 0: frames keep the exposure of the splats
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -692,8 +695,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixe
 // The fixer's trainer, for rendering and export.
 GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
 // A filter on final renders: renders the trained splats for these cameras, all of the same size, and has the fixer's restorer
-// clean up the frames as one clip, with the photos that it has in the loop. color, confidence: `count` f32 images of that size
-// with 3 and 1 channels; the splats stay as they are. GSF_ERROR_INVALID_ARGUMENT without a restorer or within a round.
+// clean up the frames as one clip, with the photos that it has in the loop, and exposes them as the photos' camera would have
+// (gsf_fix_desc.auto_exposure). color, confidence: `count` f32 images of that size with 3 and 1 channels; the splats stay as
+// they are. GSF_ERROR_INVALID_ARGUMENT without a restorer or within a round.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* fixer, const gsf_camera* cameras,
                                                          size_t count, gsf_image* color, gsf_image* confidence);
 // Checkpoint between steps. A fixer made from the same desc, views and initial splats continues from it bit-identically.
@@ -12892,7 +12896,9 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
    A brightness step between photos would become an edge in the frame where one photo ends, so colours are brought to
    one exposure per frame: that of the photos around it, since exposure and shading change gradually along a capture,
    and since the frame would otherwise contradict the photos near it. Residuals (photo - render) are not: the splats
-   follow each photo's own exposure. */
+   follow each photo's own exposure.
+   A camera with automatic exposure takes darker pictures of brighter views. What the photos tell of it (meter, once per
+   run), final frames follow (gsf__carry_meter_frame): a new photo from there would. */
 
 typedef struct gsf__carry_reference {
     gsf_camera camera;
@@ -12911,15 +12917,18 @@ typedef struct gsf__carry_study { // of one photo
     int32_t width, height;      // of the depth map
     float* depth;               // (height,width) where stereo confirms it, else 0; NULL = none
     float gain[3], offset[3];   // colour of the mean exposure = gain * colour + offset
+    double brightness;          // logarithm of the mean colour, at the mean exposure
 } gsf__carry_study;
 
 typedef struct gsf__carrier {
     int32_t study_count;
     gsf__carry_study* studies;        // of the run; NULL before gsf__carrier_study
+    double automatic;                 // share of a view's brightness that the camera's exposure makes up for: 0 = fixed
     int32_t count;
     gsf__carry_reference* references; // of the round; NULL unless open
     int has_residuals;
     float gain[3], offset[3];         // what brings the exposure of the frame that was drawn last to the mean
+    double brightness;                // of the photos around that frame
     float* inv_z;                     // scratch for one frame: z-buffers, one per slot
     void* vertices;                   // of one reference, and for each of its rows the range of their positions
     size_t inv_z_capacity, vertex_capacity;
@@ -13068,7 +13077,7 @@ static int gsf__carry_nearest(const gsf__carrier* carrier, const double center[3
 // Sets the exposure of a frame at `center` (NULL: the mean): that of the references, weighted by the inverse of the squared
 // angle between their viewing directions and the frame's.
 static void gsf__carry_set_exposure(gsf__carrier* carrier, const double* center) {
-    double gain[3] = {0.0, 0.0, 0.0}, offset[3] = {0.0, 0.0, 0.0}, total = 0.0;
+    double gain[3] = {0.0, 0.0, 0.0}, offset[3] = {0.0, 0.0, 0.0}, brightness = 0.0, total = 0.0;
     int32_t nearest[GSF__CARRY_SLOTS];
     const int count = center && carrier->study_count ? gsf__carry_nearest(carrier, center, nearest, GSF__CARRY_SLOTS) : 0;
     for (int k = 0; k < count; k++) {
@@ -13076,6 +13085,7 @@ static void gsf__carry_set_exposure(gsf__carrier* carrier, const double* center)
         const gsf__carry_study* study = carrier->studies + nearest[k];
         const double weight = 1.0 / (fmax(0.0, 1.0 - gsf__ray_cosine(ref->focus, center, ref->center)) + 1e-4);
         total += weight;
+        brightness += weight * study->brightness;
         for (int c = 0; c < 3; c++) {
             gain[c] += weight * (double)study->gain[c];
             offset[c] += weight * (double)study->offset[c];
@@ -13085,20 +13095,23 @@ static void gsf__carry_set_exposure(gsf__carrier* carrier, const double* center)
         carrier->gain[c] = count ? (float)(gain[c] / total) : 1.0f;
         carrier->offset[c] = count ? (float)(offset[c] / total) : 0.0f;
     }
+    carrier->brightness = count ? brightness / total : 0.0;
 }
 
 // ---- what depends only on the photos
 
-// A pixel of a photo of any layout with dtype u8 or f32, as 0..1, interpolated.
+// A value of a photo of any layout with dtype u8 or f32, as 0..1.
+static float gsf__carry_photo_value(const gsf_image* photo, int64_t x, int64_t y, int c) {
+    if (photo->dtype != GSF_U8) return gsf__get_pixel(photo, x, y, c);
+    return (float)((const uint8_t*)photo->data)[y * photo->stride_y + x * photo->stride_x + c * photo->stride_c] / 255.0f;
+}
+
+// A pixel of it, interpolated.
 static void gsf__carry_photo_color(const gsf_image* photo, const gsf__taps* taps, float rgb[3]) {
     for (int c = 0; c < 3; c++) {
         float v[4];
-        for (int k = 0; k < 4; k++) {
-            const int64_t x = (int64_t)taps->at[k] % photo->width, y = (int64_t)taps->at[k] / photo->width;
-            const char* at = (const char*)photo->data + y * photo->stride_y + x * photo->stride_x + c * photo->stride_c;
-            if (photo->dtype == GSF_U8) v[k] = (float)*(const uint8_t*)at / 255.0f;
-            else memcpy(v + k, at, sizeof *v);
-        }
+        for (int k = 0; k < 4; k++)
+            v[k] = gsf__carry_photo_value(photo, (int64_t)taps->at[k] % photo->width, (int64_t)taps->at[k] / photo->width, c);
         rgb[c] = gsf__blend_taps(taps, v);
     }
 }
@@ -13230,6 +13243,57 @@ static gsf_result gsf__carry_expose(gsf_context* ctx, gsf__carrier* carrier, con
     return result;
 }
 
+// Logarithm of the mean colour of a photo, with this gain and offset.
+static double gsf__carry_brightness(const gsf_image* photo, const float gain[3], const float offset[3]) {
+    double sum = 0.0;
+    for (int64_t y = 0; y < photo->height; y++)
+        for (int64_t x = 0; x < photo->width; x++)
+            for (int c = 0; c < 3; c++) sum += (double)(gain[c] * gsf__carry_photo_value(photo, x, y, c) + offset[c]);
+    return gsf__log_f64(fmax(sum / (3.0 * (double)photo->width * (double)photo->height), 1e-3));
+}
+
+// Finds the photos' brightness, and how the camera's exposure followed it: the slope of a line through the photos. Those of a
+// fixed exposure give 0, those of an automatic one 0.7 to 1; where all are nearly as bright, no slope can be told: prior 0.
+static void gsf__carry_meter(gsf__carrier* carrier, const gsf_scene_view* views) {
+    static const float one[3] = {1.0f, 1.0f, 1.0f}, zero[3] = {0.0f, 0.0f, 0.0f};
+    const double count = carrier->study_count, unsure = count * 0.02 * 0.02;
+    double brightness = 0.0, exposure = 0.0, square = 0.0, product = 0.0;
+    for (int32_t i = 0; i < carrier->study_count; i++) {
+        gsf__carry_study* study = carrier->studies + i;
+        const double plain = gsf__carry_brightness(&views[i].image, one, zero);
+        study->brightness = gsf__carry_brightness(&views[i].image, study->gain, study->offset);
+        brightness += study->brightness;
+        exposure += plain - study->brightness;
+        square += study->brightness * study->brightness;
+        product += study->brightness * (plain - study->brightness);
+    }
+    square -= brightness * brightness / count;
+    product -= brightness * exposure / count;
+    const double slope = -product / (square + unsure);
+    carrier->automatic = slope < 1.0 ? fmax(slope, 0.0) : 1.0;
+}
+
+// The factor by which the camera would have exposed a frame otherwise than the photos around it, whose exposure its render has:
+// below 1 if it is brighter than these photos, at most half a stop. What no splat covers is taken to be as bright as they.
+static float gsf__carry_meter_frame(gsf__carrier* carrier, const gsf_camera* camera, const gsf_image* render,
+                                    const gsf_image* alpha, const float background[3], double share) {
+    const double most = 0.34657359027997264; // log 2 / 2
+    double center[3], sum = 0.0;
+    gsf_get_camera_center(camera, center);
+    gsf__carry_set_exposure(carrier, center);
+    const float around = (float)gsf__exp_f64(carrier->brightness);
+    for (int64_t y = 0; y < render->height; y++)
+        for (int64_t x = 0; x < render->width; x++)
+            for (int c = 0; c < 3; c++) {
+                const float hole = 1.0f - gsf__get_pixel(alpha, x, y, 0);
+                const float splats = gsf__get_pixel(render, x, y, c) - hole * background[c];
+                sum += (double)(carrier->gain[c] * splats + (1.0f - hole) * carrier->offset[c] + hole * around);
+            }
+    const double frame = gsf__log_f64(fmax(sum / (3.0 * (double)render->width * (double)render->height), 1e-3));
+    const double change = share * carrier->automatic * (carrier->brightness - frame);
+    return (float)gsf__exp_f64(change < -most ? -most : change < most ? change : most);
+}
+
 static gsf_result gsf__carry_keep_maps(gsf_context* ctx, gsf__carrier* carrier, const gsf_dense* dense) {
     for (size_t m = 0; m < dense->map_count; m++) {
         const gsf_dense_map* map = dense->maps + m;
@@ -13280,6 +13344,7 @@ static gsf_result gsf__carrier_study(gsf_context* ctx, gsf__carrier* carrier, gs
         result = gsf_splat_make_dense(ctx, &scene, order, (size_t)count, NULL, &desc, &dense, NULL);
     if (result == GSF_OK) result = gsf__carry_keep_maps(ctx, carrier, &dense);
     if (result == GSF_OK) result = gsf__carry_expose(ctx, carrier, views);
+    if (result == GSF_OK) gsf__carry_meter(carrier, views);
     gsf_splat_destroy_dense(ctx, &dense);
     gsf_free(ctx, scene.track_begin);
     gsf_free(ctx, order);
@@ -14364,6 +14429,7 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     d.lambda = gsf__or_zero(d.lambda, 1.0f);
     if (d.frame_scale == 0.0f) d.frame_scale = 1.0f;
+    d.auto_exposure = gsf__or_zero(d.auto_exposure, 1.0f);
     return d;
 }
 
@@ -14380,6 +14446,8 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (!(d->frame_scale > 0.0f && d->frame_scale <= 1.0f) || d->max_pixels < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid frame_scale %g or max_pixels %d",
                         (double)d->frame_scale, (int)d->max_pixels);
+    if (!(d->auto_exposure >= 0.0f && d->auto_exposure <= 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid auto_exposure %g", (double)d->auto_exposure);
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
@@ -14888,6 +14956,19 @@ static gsf_result gsf__render_views(gsf_context* ctx, const gsf_fixer* f, const 
     return GSF_OK;
 }
 
+// Exposes a restored frame as the photos' camera would have.
+static void gsf__expose_view(gsf_fixer* f, const gsf_camera* camera, const gsf_image* render, const gsf_image* alpha,
+                             gsf_image* color) {
+    const float factor = gsf__carry_meter_frame(&f->carrier, camera, render, alpha, f->trainer->desc.render.background,
+                                                (double)f->desc.auto_exposure);
+    for (int64_t y = 0; y < color->height; y++)
+        for (int64_t x = 0; x < color->width; x++)
+            for (int c = 0; c < 3; c++) {
+                const float value = factor * gsf__get_pixel(color, x, y, c);
+                gsf__put_pixel(color, x, y, c, value < 1.0f ? value : 1.0f);
+            }
+}
+
 GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras, size_t count,
                                            gsf_image* color, gsf_image* confidence) {
     gsf_restore_window window;
@@ -14913,6 +14994,8 @@ GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const
     window.out_confidence = confidence;
     gsf__lend_carrier(f, &window, images ? images + count : NULL);
     if (result == GSF_OK) result = gsf_restore_clip(ctx, f->restorer, &window);
+    if (result == GSF_OK && f->limits.needs_carried > 0 && f->carrier.automatic > 0.0)
+        for (size_t i = 0; i < count; i++) gsf__expose_view(f, cameras + i, images + i, images + 2 * count + i, color + i);
     for (size_t i = 0; images && i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);
     gsf_free(ctx, images);
     gsf_free(ctx, known);

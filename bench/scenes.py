@@ -7,7 +7,8 @@
 Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`. PROGRAM is another build of the program; {scene} in ARGS is
 the name of the scene's folder. The tables give, for each view count, PSNR and SSIM over all pixels and CPU seconds per scene,
 and the differences from the arm --base (the first one by default): in the mean over scenes with its standard error, for the
-scene that loses most, and with --per-scene for each. A run that has left result.json is not repeated; --tables runs nothing.
+scene that loses most, and with --per-scene for each. An arm with --filtered has another one, NAME+filter: the same renders,
+cleaned up by the restorer. A run that has left result.json is not repeated; --tables runs nothing.
 Needs only the standard library.
 """
 import argparse
@@ -20,6 +21,7 @@ import shutil
 from runs import mean_and_error, read_json, run, split_arm, write_json
 
 FIGURES = ("psnr", "ssim", "splats", "cpu_seconds")
+FILTER = "+filter"
 
 
 def name_of(scene):
@@ -43,7 +45,8 @@ def work(options, job, program, extra):
         _, cpu = run(command + shlex.split(options.size) + shlex.split(options.common) +
                      shlex.split(extra.replace("{scene}", name_of(scene))))
         metrics = read_json(os.path.join(out, "run", "metrics.json"))
-        write_json(path, {"psnr": metrics["psnr"], "ssim": metrics["ssim"], "splats": metrics["splats"], "cpu_seconds": cpu})
+        row = {"psnr": metrics["psnr"], "ssim": metrics["ssim"], "splats": metrics["splats"], "cpu_seconds": cpu}
+        write_json(path, dict(row, filtered={f: metrics["filtered"][f] for f in FIGURES[:2]}) if "filtered" in metrics else row)
         if not options.keep:
             shutil.rmtree(os.path.join(out, "run"))
     return read_json(path)
@@ -54,7 +57,9 @@ def mean(values):
 
 
 def result_of(options, job):
-    return read_json(os.path.join(folder_of(options, job), "result.json"))
+    scene, views, arm, seed = job
+    row = read_json(os.path.join(folder_of(options, (scene, views, arm.removesuffix(FILTER), seed)), "result.json"))
+    return dict(row, **row["filtered"]) if row and arm.endswith(FILTER) else row
 
 
 def table(options, views, arms):
@@ -147,7 +152,8 @@ def main():
                 row = future.result()
                 print("%-16s K=%s %-12s seed %d: psnr %.3f ssim %.4f, %.0f CPU s" % (
                     name_of(scene), views, arm, seed, row["psnr"], row["ssim"], row["cpu_seconds"]), flush=True)
-    print(tables(options, list(arms)))
+    print(tables(options, [shown for name, (_, extra) in arms.items() for shown in
+                           [name] + [name + FILTER] * ("--filtered" in extra.split())]))
 
 
 if __name__ == "__main__":

@@ -74,6 +74,9 @@ static const option_spec option_specs[] = {
      "clean up the renders with the training views (--views) of the scene: a filter, the splats stay as they are"},
     {"--filtered", FLAG, AT(filtered), 0, 0, NULL, "fix",
      "have the restorer clean up the final renders of the held-out views, too: filtered/, and figures of their own"},
+    {"--fixed-exposure", FLAG, AT(fixed_exposure), 0, 0, NULL, "fix render",
+     "what the restorer cleans up (fix: with --filtered) keeps the exposure of the splats; by default, frames of warp and\n"
+     "mini are exposed as the photos' camera would have, if that chose exposures by what it saw"},
     {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore evaluate",
      "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
@@ -964,6 +967,7 @@ static gsf_result open_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats
     if (result == GSF_OK)
         result = gsf_splat_load_train_views(&app->ctx, scene, f->split.train, f->split.train_count, &f->views);
     fix.train.render = *desc;
+    if (app->o.fixed_exposure) fix.auto_exposure = -1.0f;
     fix.train.seed = app->o.seed;
     if (result == GSF_OK)
         result = gsf_splat_make_fixer(&app->ctx, &fix, f->views, f->split.train_count, splats, &f->restorer, &f->fixer);
@@ -1071,6 +1075,7 @@ static int run_render(gsfix_app* app) {
     if (filtered && strcmp(r, "warp") != 0 && !is_mini(r))
         return gsfix_misused(app, "--restorer %s: render takes none|warp|mini[:FILE]", r);
     if (filtered && !app->o.scene) return gsfix_misused(app, "--restorer: needs the photos of a --scene");
+    if (app->o.fixed_exposure && !filtered) return gsfix_misused(app, "--fixed-exposure: needs a --restorer");
     if (!filtered && !app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
     if (app->o.depth_as && !depth_is_exr(app) && !depth_is_png(app))
         return gsfix_misused(app, "--depth-as %s: one of exr and png16", app->o.depth_as);

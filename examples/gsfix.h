@@ -19,7 +19,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features, *lora;
     const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot, *video;
-    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered;
+    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered, fixed_exposure;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     int clean_iterations, seeds, spz_version, fps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache, orbit;

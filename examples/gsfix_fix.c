@@ -178,6 +178,7 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
         train->lr_scales = 0.0f;
     }
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
+    if (app->o.fixed_exposure) setup->fix.auto_exposure = -1.0f;
     int code = apply_settings(app, setup);
     const char* background = app->o.background ? app->o.background : regularized ? "photos" : "black";
     if (!code) code = gsfix_background(app, background, train->background, &train->background_kind);
@@ -189,6 +190,7 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
     if (app->o.compare && !has_restorer(app))
         return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     if (app->o.filtered && !has_restorer(app)) return gsfix_misused(app, "--filtered: needs a --restorer");
+    if (app->o.fixed_exposure && !app->o.filtered) return gsfix_misused(app, "--fixed-exposure: needs --filtered");
     return gsfix_check_restorer(app);
 }
 

@@ -1,5 +1,5 @@
 // test_carry.c - what photos show in other views (carry_fn of a restorer's windows) against a ray-traced scene: reach and
-// colours, exposure, masks; the same bits for any number of workers and after a checkpoint; failing allocations.
+// colours, exposures, masks; the same bits for any number of workers and after a checkpoint; failing allocations.
 #define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
 #include "gsfixer_splat.h"
@@ -32,12 +32,33 @@ static void locate(const gsf_camera* camera, double x, double y, double z, doubl
     for (int k = 0; k < 3; k++) point[k] = c2w[k] * a + c2w[4 + k] * b + c2w[8 + k] * z + c2w[12 + k];
 }
 
-// The courtyard, with every third pixel's surface point in both directions as the start.
-static int make_capture(gsf_context* ctx, shots* c) {
+// Splats at the surface points of every third pixel in both directions.
+static int make_start(gsf_context* ctx, shots* c) {
     static double points[3 * POINTS];
     static uint8_t colors[3 * POINTS];
-    make_scene_options o = make_scene_defaults;
     size_t n = 0;
+    for (int v = 0; v < VIEWS; v++)
+        for (int y = 1; y < HEIGHT; y += 3)
+            for (int x = 1; x < WIDTH; x += 3) {
+                const int at = y * WIDTH + x;
+                if (!(c->depth[v][at] > 0.0f)) continue; // sky
+                locate(&c->views[v].camera, x + 0.5, y + 0.5, (double)c->depth[v][at], points + 3 * n);
+                memcpy(colors + 3 * n++, c->pixels[v] + 3 * at, 3);
+            }
+    return CHECK_OK(ctx, gsf_splat_make_from_points(ctx, points, colors, n, NULL, 0, NULL, &c->start));
+}
+
+static gsf_camera capture_camera(shots* c, int index) { // of 24 around the courtyard; the photos are 6, 7, ...
+    make_scene_options o = make_scene_defaults;
+    o.views = 24;
+    o.width = WIDTH;
+    o.height = HEIGHT;
+    return camera_of(&c->s, &o, index);
+}
+
+// The courtyard.
+static int make_capture(gsf_context* ctx, shots* c) {
+    make_scene_options o = make_scene_defaults;
     memset(c, 0, sizeof *c);
     o.views = 24;
     o.width = WIDTH;
@@ -45,18 +66,11 @@ static int make_capture(gsf_context* ctx, shots* c) {
     if (!CHECK(start_world(ctx, &c->s, &o))) return 0;
     for (int v = 0; v < VIEWS; v++) {
         gsf_train_view* view = c->views + v;
-        view->camera = camera_of(&c->s, &o, 6 + v);
+        view->camera = capture_camera(c, 6 + v);
         take(ctx, &c->s, &view->camera, c->pixels[v], c->depth[v], c->normal);
         view->image = gsf_wrap_image(c->pixels[v], GSF_U8, WIDTH, HEIGHT, 3);
-        for (int y = 1; y < HEIGHT; y += 3)
-            for (int x = 1; x < WIDTH; x += 3) {
-                const int at = y * WIDTH + x;
-                if (!(c->depth[v][at] > 0.0f)) continue; // sky
-                locate(&view->camera, x + 0.5, y + 0.5, (double)c->depth[v][at], points + 3 * n);
-                memcpy(colors + 3 * n++, c->pixels[v] + 3 * at, 3);
-            }
     }
-    return CHECK_OK(ctx, gsf_splat_make_from_points(ctx, points, colors, n, NULL, 0, NULL, &c->start));
+    return make_start(ctx, c);
 }
 
 static void drop_capture(gsf_context* ctx, shots* c) {
@@ -187,7 +201,7 @@ static void probe_init(probe* p, const shots* c, int judges) {
     p->digest = 14695981039346656037u;
 }
 
-static gsf_fixer* make_fixer(gsf_context* ctx, const shots* c, const probe* p) {
+static gsf_fixer* make_fixer(gsf_context* ctx, const shots* c, const probe* p, float auto_exposure) {
     gsf_fix_desc desc = {0};
     gsf_fixer* fixer = NULL;
     desc.train.iterations = 8;
@@ -196,6 +210,7 @@ static gsf_fixer* make_fixer(gsf_context* ctx, const shots* c, const probe* p) {
     desc.last_round = 6;
     desc.windows = 1;
     desc.window_frames = FRAMES;
+    desc.auto_exposure = auto_exposure;
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, c->views, VIEWS, &c->start, &p->restorer, &fixer));
     return fixer;
 }
@@ -208,7 +223,7 @@ static int finish(gsf_context* ctx, gsf_fixer* fixer) {
 }
 
 static void run(gsf_context* ctx, const shots* c, probe* p) {
-    gsf_fixer* fixer = make_fixer(ctx, c, p);
+    gsf_fixer* fixer = make_fixer(ctx, c, p, 0.0f);
     if (fixer) finish(ctx, fixer);
     gsf_splat_destroy_fixer(ctx, fixer);
     CHECK(p->windows == 2);
@@ -253,6 +268,64 @@ static void test_exposure(gsf_context* ctx, shots* c) {
     memcpy(c->pixels, kept, sizeof kept);
 }
 
+static double mean_of(const gsf_image* image) {
+    double sum = 0.0;
+    for (int i = 0; i < 3 * PIXELS; i++)
+        sum += image->dtype == GSF_U8 ? ((const uint8_t*)image->data)[i] / 255.0 : (double)((const float*)image->data)[i];
+    return sum / (3 * PIXELS);
+}
+
+// Mean colours of final frames before the first photo and behind the last one, which are darker and brighter than these.
+static void filter_frames(gsf_context* ctx, shots* c, float auto_exposure, double means[2]) {
+    static float color[2][3 * PIXELS], confidence[2][PIXELS];
+    static probe p;
+    const gsf_camera cameras[2] = {capture_camera(c, 3), capture_camera(c, 12)};
+    gsf_image colors[2], confidences[2];
+    for (int i = 0; i < 2; i++) {
+        colors[i] = gsf_wrap_image(color[i], GSF_F32, WIDTH, HEIGHT, 3);
+        confidences[i] = gsf_wrap_image(confidence[i], GSF_F32, WIDTH, HEIGHT, 1);
+    }
+    for (size_t i = 0; i < c->start.count; i++) {
+        for (int k = 0; k < 3; k++) c->start.log_scales[3 * i + k] += 0.4f; // without holes
+        c->start.opacity_logits[i] = 5.0f;
+    }
+    probe_init(&p, c, 0);
+    gsf_fixer* fixer = make_fixer(ctx, c, &p, auto_exposure);
+    if (fixer && finish(ctx, fixer))
+        CHECK_OK(ctx, gsf_splat_restore_views(ctx, fixer, cameras, 2, colors, confidences));
+    for (int i = 0; i < 2; i++) means[i] = mean_of(colors + i);
+    gsf_splat_destroy_fixer(ctx, fixer);
+    gsf_splat_destroy(ctx, &c->start);
+    make_start(ctx, c);
+}
+
+// Photos of one exposure leave the filter's frames as they are. Such as an automatic exposure made equally bright have it
+// expose the darker frame more, and the brighter one less.
+static void test_metering(gsf_context* ctx, shots* c) {
+    static uint8_t kept[VIEWS][3 * PIXELS];
+    double plain[2], exposed[2], half[2];
+    memcpy(kept, c->pixels, sizeof kept);
+    filter_frames(ctx, c, -1.0f, plain);
+    filter_frames(ctx, c, 0.0f, exposed);
+    printf("frames from photos of one exposure: %.3f, %.3f -> %.3f, %.3f\n", plain[0], plain[1], exposed[0], exposed[1]);
+    CHECK(fabs(exposed[0] - plain[0]) < 0.005 && fabs(exposed[1] - plain[1]) < 0.005);
+    for (int v = 0; v < VIEWS; v++) {
+        const double exposure = 0.5 / mean_of(&c->views[v].image);
+        for (int i = 0; i < 3 * PIXELS; i++) c->pixels[v][i] = (uint8_t)fmin(255.0, c->pixels[v][i] * exposure + 0.5);
+    }
+    gsf_splat_destroy(ctx, &c->start);
+    make_start(ctx, c);
+    filter_frames(ctx, c, -1.0f, plain);
+    filter_frames(ctx, c, 0.0f, exposed);
+    filter_frames(ctx, c, 0.5f, half);
+    printf("from photos of mean 0.5: %.3f, %.3f -> %.3f, %.3f\n", plain[0], plain[1], exposed[0], exposed[1]);
+    CHECK(exposed[0] > 1.02 * plain[0] && exposed[1] < 0.98 * plain[1]);
+    for (int i = 0; i < 2; i++) CHECK(fabs(half[i] * half[i] / (plain[i] * exposed[i]) - 1.0) < 0.002);
+    memcpy(c->pixels, kept, sizeof kept);
+    gsf_splat_destroy(ctx, &c->start);
+    make_start(ctx, c);
+}
+
 static void test_mask(gsf_context* ctx, shots* c) {
     static uint8_t weight[PIXELS];
     static probe p, open;
@@ -283,13 +356,13 @@ static void test_same_bits(gsf_context* ctx, const shots* c, uint64_t wanted) {
     probe_init(&p, c, 0);
     gsf_buffer chunks = {0};
     gsf_fix_stats stats = {0};
-    gsf_fixer* fixer = make_fixer(ctx, c, &p);
+    gsf_fixer* fixer = make_fixer(ctx, c, &p, 0.0f);
     while (stats.stage != GSF_FIX_DONE && CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) {
         chunks.size = 0;
         gsf_splat_format_fixer(ctx, fixer, &chunks);
         gsf_append_last_chunk(ctx, &chunks);
         gsf_splat_destroy_fixer(ctx, fixer);
-        fixer = make_fixer(ctx, c, &p);
+        fixer = make_fixer(ctx, c, &p, 0.0f);
         if (!CHECK_OK(ctx, gsf_splat_parse_fixer(ctx, fixer, "checkpoint", chunks.data, chunks.size))) break;
     }
     gsf_splat_destroy_fixer(ctx, fixer);
@@ -328,7 +401,7 @@ static void test_failing(const shots* whole_photos) {
     crop(whole_photos, &middle);
     probe_init(&p, c, 0);
     probe_init(&whole, c, 0);
-    gsf_fixer *fixer = make_fixer(&ctx, c, &p), *same = make_fixer(&ctx, c, &whole);
+    gsf_fixer *fixer = make_fixer(&ctx, c, &p, 0.0f), *same = make_fixer(&ctx, c, &whole, 0.0f);
     for (int i = 0; i < 2; i++)
         for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_PLAN;)
             if (!CHECK_OK(&ctx, gsf_splat_step_fixer(&ctx, i ? same : fixer, &stats))) return;
@@ -358,6 +431,7 @@ int main(void) {
         test_truth(&ctx, &c, &p);
         test_same_bits(&ctx, &c, p.digest);
         test_exposure(&ctx, &c);
+        test_metering(&ctx, &c);
         test_mask(&ctx, &c);
         test_failing(&c);
     }

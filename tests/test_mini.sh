@@ -75,10 +75,12 @@ assert abs(m["filtered"]["psnr"] - sum(views) / len(views)) < 1e-9 and m["filter
 assert m["filtered"]["psnr"] != m["psnr"] and sum(r["frames_restored"] for r in m["rounds"]) > 0
 PY
 "$gsfix" render fix1/splats.ply --scene "$scene" --views 3 --restorer mini --out clean > /dev/null 2>&1 # weights that come along
+"$gsfix" render fix1/splats.ply --scene "$scene" --views 3 --restorer mini --fixed-exposure --out fixed > /dev/null 2>&1
 "$gsfix" render fix1/splats.ply --scene "$scene" --out plain > /dev/null 2>&1
 [ "$(ls clean/*.png | wc -l)" = "$(ls plain/*.png | wc -l)" ] || fail "not all views are rendered"
 cmp -s clean/frame_001.png plain/frame_001.png && fail "the filter changes nothing"
 for wrong in "fix $scene --out x --restorer mini:" "fix $scene --out x --filtered" \
+    "fix $scene --out x --restorer mini --fixed-exposure" "render fix1/splats.ply --scene $scene --out x --fixed-exposure" \
     "render fix1/splats.ply --path p.json --out x --restorer mini" "render fix1/splats.ply --scene $scene --out x --restorer dit:x"; do
     status=0
     "$gsfix" $wrong > /dev/null 2> error.txt || status=$?
