@@ -41,6 +41,7 @@ gsfixer_splat.h|golden_splat|opacity reset raises opacities|s/if \(group->value\
 gsfixer_splat.h|golden_splat|opacity reset keeps the second moments|s/(group->value\[i\] = logit;\s*memset\(group->m,[^;]*;)\s*memset\(group->v,[^;]*;/$1/
 gsfixer_splat.h|test_trainer|MCMC: splats clamped to prune_opacity count as dead|s/(dead \+= model->groups\[GSF__OPACITY\]\.value\[i\]) < logit/$1 <= logit/
 gsfixer_splat.h|test_visibility|visible points: a tolerance of zero is refused|s/("tolerance", \(double\)d->tolerance, )0,/${1}FLT_MIN,/
+gsfixer_splat.h|test_carry|exposure: the camera exposes brighter views more|s/const double slope = -product/const double slope = product/
 gsfixer_splat.h|test_fixer|warp: bytes of photos divided by 256|s/\(plane\[taps->at\[k\] \* channels \+ channel\] \/ one\)/(plane[taps->at[k] * channels + channel] \/ (one + 1.0))/
 gsfixer_splat.h|test_scene|PLY: f_rest is written coefficient by coefficient|s/gsf__put_f32\(p, sh\[3 \* k \+ channel\]\)/gsf__put_f32(p, sh[3 * (1 + (channel * (bands - 1) + k - 1) \/ 3) + (channel * (bands - 1) + k - 1) % 3])/
 gsfixer_splat.h|test_scene|undistortion: tangential terms swapped|s/\*u = x \* scale \+ 2\.0 \* k\[2\] \* x \* y \+ k\[3\] \*/*u = x * scale + 2.0 * k[3] * x * y + k[2] */
