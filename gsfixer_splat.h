@@ -13243,13 +13243,18 @@ static gsf_result gsf__carry_expose(gsf_context* ctx, gsf__carrier* carrier, con
     return result;
 }
 
-// Logarithm of the mean colour of a photo, with this gain and offset.
-static double gsf__carry_brightness(const gsf_image* photo, const float gain[3], const float offset[3]) {
-    double sum = 0.0;
+// Logarithm of a photo's mean colour with this gain and offset, over the pixels that its mask leaves.
+static double gsf__carry_brightness(const gsf_scene_view* view, const float gain[3], const float offset[3]) {
+    const gsf_image *photo = &view->image, *mask = &view->weight;
+    double sum = 0.0, pixels = 0.0;
     for (int64_t y = 0; y < photo->height; y++)
-        for (int64_t x = 0; x < photo->width; x++)
-            for (int c = 0; c < 3; c++) sum += (double)(gain[c] * gsf__carry_photo_value(photo, x, y, c) + offset[c]);
-    return gsf__log_f64(fmax(sum / (3.0 * (double)photo->width * (double)photo->height), 1e-3));
+        for (int64_t x = 0; x < photo->width; x++) {
+            const float weight = mask->data ? gsf__carry_photo_value(mask, x, y, 0) : 1.0f;
+            pixels += (double)weight;
+            for (int c = 0; c < 3; c++)
+                sum += (double)(weight * (gain[c] * gsf__carry_photo_value(photo, x, y, c) + offset[c]));
+        }
+    return gsf__log_f64(fmax(sum / fmax(3.0 * pixels, 1.0), 1e-3));
 }
 
 // Finds the photos' brightness, and how the camera's exposure followed it: the slope of a line through the photos. Those of a
@@ -13260,8 +13265,8 @@ static void gsf__carry_meter(gsf__carrier* carrier, const gsf_scene_view* views)
     double brightness = 0.0, exposure = 0.0, square = 0.0, product = 0.0;
     for (int32_t i = 0; i < carrier->study_count; i++) {
         gsf__carry_study* study = carrier->studies + i;
-        const double plain = gsf__carry_brightness(&views[i].image, one, zero);
-        study->brightness = gsf__carry_brightness(&views[i].image, study->gain, study->offset);
+        const double plain = gsf__carry_brightness(views + i, one, zero);
+        study->brightness = gsf__carry_brightness(views + i, study->gain, study->offset);
         brightness += study->brightness;
         exposure += plain - study->brightness;
         square += study->brightness * study->brightness;
