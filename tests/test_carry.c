@@ -304,14 +304,6 @@ static void filter_frames(gsf_context* ctx, shots* c, float auto_exposure, doubl
 static void test_metering(gsf_context* ctx, shots* c) {
     static uint8_t kept[VIEWS][3 * PIXELS];
     double plain[2], exposed[2], half[2];
-    gsf_scene_view masked;
-    uint8_t photo[6] = {51, 51, 51, 255, 255, 255}, mask[2] = {255, 0};
-    const float gain[3] = {2.0f, 2.0f, 2.0f}, offset[3] = {0.1f, 0.1f, 0.1f};
-    memset(&masked, 0, sizeof masked);
-    masked.image = gsf_wrap_image(photo, GSF_U8, 2, 1, 3);
-    CHECK(fabs(gsf__carry_brightness(&masked, gain, offset) - log(1.3)) < 1e-6); // the mean of 0.5 and 2.1
-    masked.weight = gsf_wrap_image(mask, GSF_U8, 2, 1, 1);
-    CHECK(fabs(gsf__carry_brightness(&masked, gain, offset) - log(0.5)) < 1e-6);
     memcpy(kept, c->pixels, sizeof kept);
     filter_frames(ctx, c, -1.0f, plain);
     filter_frames(ctx, c, 0.0f, exposed);

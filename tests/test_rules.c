@@ -283,6 +283,18 @@ static void test_dense_angles(void) {
     CHECK(gsf__dense_desc_defaults(NULL).max_normal_angle == 40.0f);
 }
 
+// The mean colour of a photo, of all its pixels or of those that a mask leaves.
+static void test_brightness(void) {
+    uint8_t photo[6] = {51, 51, 51, 255, 255, 255}, mask[2] = {255, 0};
+    const float gain[3] = {2.0f, 2.0f, 2.0f}, offset[3] = {0.1f, 0.1f, 0.1f};
+    gsf_scene_view view;
+    memset(&view, 0, sizeof view);
+    view.image = gsf_wrap_image(photo, GSF_U8, 2, 1, 3);
+    CHECK(fabs(gsf__carry_brightness(&view, gain, offset) - log(1.3)) < 1e-6); // the mean of 0.5 and 2.1
+    view.weight = gsf_wrap_image(mask, GSF_U8, 2, 1, 1);
+    CHECK(fabs(gsf__carry_brightness(&view, gain, offset) - log(0.5)) < 1e-6);
+}
+
 int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
@@ -294,5 +306,6 @@ int main(void) {
     test_warp_groups();
     test_warp_hidden();
     test_dense_angles();
+    test_brightness();
     return test_report();
 }
