@@ -59,7 +59,9 @@ def mean(values):
 def result_of(options, job):
     scene, views, arm, seed = job
     row = read_json(os.path.join(folder_of(options, (scene, views, arm.removesuffix(FILTER), seed)), "result.json"))
-    return dict(row, **row["filtered"]) if row and arm.endswith(FILTER) else row
+    if not arm.endswith(FILTER):
+        return row
+    return dict(row, **row["filtered"]) if row and "filtered" in row else None
 
 
 def table(options, views, arms):
