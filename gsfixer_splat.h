@@ -13243,34 +13243,39 @@ static gsf_result gsf__carry_expose(gsf_context* ctx, gsf__carrier* carrier, con
     return result;
 }
 
-// Logarithm of a photo's mean colour with this gain and offset, over the pixels that its mask leaves.
-static double gsf__carry_brightness(const gsf_scene_view* view, const float gain[3], const float offset[3]) {
+// A photo's mean colour over the pixels that its mask leaves.
+static void gsf__carry_mean(const gsf_scene_view* view, double mean[3]) {
     const gsf_image *photo = &view->image, *mask = &view->weight;
-    double sum = 0.0, pixels = 0.0;
+    double pixels = 0.0;
+    mean[0] = mean[1] = mean[2] = 0.0;
     for (int64_t y = 0; y < photo->height; y++)
         for (int64_t x = 0; x < photo->width; x++) {
             const float weight = mask->data ? gsf__carry_photo_value(mask, x, y, 0) : 1.0f;
             pixels += (double)weight;
-            for (int c = 0; c < 3; c++)
-                sum += (double)(weight * (gain[c] * gsf__carry_photo_value(photo, x, y, c) + offset[c]));
+            for (int c = 0; c < 3; c++) mean[c] += (double)(weight * gsf__carry_photo_value(photo, x, y, c));
         }
-    return gsf__log_f64(fmax(sum / fmax(3.0 * pixels, 1.0), 1e-3));
+    for (int c = 0; c < 3; c++) mean[c] /= fmax(pixels, 1.0);
 }
 
 // Finds the photos' brightness, and how the camera's exposure followed it: the slope of a line through the photos. Those of a
 // fixed exposure give 0, those of an automatic one 0.7 to 1; where all are nearly as bright, no slope can be told: prior 0.
 static void gsf__carry_meter(gsf__carrier* carrier, const gsf_scene_view* views) {
-    static const float one[3] = {1.0f, 1.0f, 1.0f}, zero[3] = {0.0f, 0.0f, 0.0f};
-    const double count = carrier->study_count, unsure = count * 0.02 * 0.02;
+    const double count = carrier->study_count, unsure = count * 0.02 * 0.02, dark = 1e-3;
     double brightness = 0.0, exposure = 0.0, square = 0.0, product = 0.0;
     for (int32_t i = 0; i < carrier->study_count; i++) {
         gsf__carry_study* study = carrier->studies + i;
-        const double plain = gsf__carry_brightness(views + i, one, zero);
-        study->brightness = gsf__carry_brightness(views + i, study->gain, study->offset);
+        double mean[3], as_taken = 0.0, at_one_exposure = 0.0;
+        gsf__carry_mean(views + i, mean);
+        for (int c = 0; c < 3; c++) {
+            as_taken += mean[c] / 3.0;
+            at_one_exposure += ((double)study->gain[c] * mean[c] + (double)study->offset[c]) / 3.0;
+        }
+        study->brightness = gsf__log_f64(fmax(at_one_exposure, dark));
+        const double exposed = gsf__log_f64(fmax(as_taken, dark)) - study->brightness;
         brightness += study->brightness;
-        exposure += plain - study->brightness;
+        exposure += exposed;
         square += study->brightness * study->brightness;
-        product += study->brightness * (plain - study->brightness);
+        product += study->brightness * exposed;
     }
     square -= brightness * brightness / count;
     product -= brightness * exposure / count;
@@ -14999,8 +15004,9 @@ GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const
     window.out_confidence = confidence;
     gsf__lend_carrier(f, &window, images ? images + count : NULL);
     if (result == GSF_OK) result = gsf_restore_clip(ctx, f->restorer, &window);
-    if (result == GSF_OK && f->limits.needs_carried > 0 && f->carrier.automatic > 0.0)
-        for (size_t i = 0; i < count; i++) gsf__expose_view(f, cameras + i, images + i, images + 2 * count + i, color + i);
+    const int exposed = f->limits.needs_carried > 0 && f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0;
+    for (size_t i = 0; i < count && exposed && result == GSF_OK; i++)
+        gsf__expose_view(f, cameras + i, images + i, images + 2 * count + i, color + i);
     for (size_t i = 0; images && i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);
     gsf_free(ctx, images);
     gsf_free(ctx, known);

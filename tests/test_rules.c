@@ -284,15 +284,46 @@ static void test_dense_angles(void) {
 }
 
 // The mean colour of a photo, of all its pixels or of those that a mask leaves.
-static void test_brightness(void) {
-    uint8_t photo[6] = {51, 51, 51, 255, 255, 255}, mask[2] = {255, 0};
-    const float gain[3] = {2.0f, 2.0f, 2.0f}, offset[3] = {0.1f, 0.1f, 0.1f};
+static void test_mean(void) {
+    uint8_t photo[6] = {51, 102, 0, 255, 204, 0}, mask[2] = {255, 0};
+    double mean[3];
     gsf_scene_view view;
     memset(&view, 0, sizeof view);
     view.image = gsf_wrap_image(photo, GSF_U8, 2, 1, 3);
-    CHECK(fabs(gsf__carry_brightness(&view, gain, offset) - log(1.3)) < 1e-6); // the mean of 0.5 and 2.1
+    gsf__carry_mean(&view, mean);
+    CHECK(fabs(mean[0] - 0.6) < 1e-6 && fabs(mean[1] - 0.6) < 1e-6 && mean[2] == 0.0);
     view.weight = gsf_wrap_image(mask, GSF_U8, 2, 1, 1);
-    CHECK(fabs(gsf__carry_brightness(&view, gain, offset) - log(0.5)) < 1e-6);
+    gsf__carry_mean(&view, mean);
+    CHECK(fabs(mean[0] - 0.2) < 1e-6 && fabs(mean[1] - 0.4) < 1e-6 && mean[2] == 0.0);
+    mask[0] = 0;
+    gsf__carry_mean(&view, mean);
+    CHECK(mean[0] == 0.0 && mean[1] == 0.0 && mean[2] == 0.0);
+}
+
+// A camera that makes every photo as bright has the slope 1, one of a fixed exposure 0, and so has one whose photos are alike.
+static void test_meter(void) {
+    enum { PHOTOS = 3 };
+    uint8_t photos[PHOTOS][3];
+    gsf_scene_view views[PHOTOS];
+    gsf__carry_study studies[PHOTOS];
+    gsf__carrier carrier;
+    memset(views, 0, sizeof views);
+    memset(studies, 0, sizeof studies);
+    memset(&carrier, 0, sizeof carrier);
+    carrier.studies = studies;
+    carrier.study_count = PHOTOS;
+    for (int kind = 0; kind < 3; kind++) {
+        for (int i = 0; i < PHOTOS; i++) {
+            const int shown = kind == 2 ? 100 : 60 + 40 * i; // at one exposure
+            memset(photos[i], kind ? shown : 100, 3);
+            views[i].image = gsf_wrap_image(photos[i], GSF_U8, 1, 1, 3);
+            for (int c = 0; c < 3; c++) studies[i].gain[c] = kind ? 1.0f : (float)shown / 100.0f;
+        }
+        gsf__carry_meter(&carrier, views);
+        CHECK(kind ? carrier.automatic == 0.0 : carrier.automatic > 0.98 && carrier.automatic <= 1.0);
+        for (int i = 0; i < PHOTOS; i++)
+            CHECK(fabs(exp(studies[i].brightness) * 255.0 - (kind == 2 ? 100 : 60 + 40 * i)) < 1e-3);
+    }
 }
 
 int main(void) {
@@ -306,6 +337,7 @@ int main(void) {
     test_warp_groups();
     test_warp_hidden();
     test_dense_angles();
-    test_brightness();
+    test_mean();
+    test_meter();
     return test_report();
 }
