@@ -621,7 +621,8 @@ typedef struct gsf_nn_mini_desc {
 
 /* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
    the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains,
-   from which the confidence is made; that is 0 where no photo shows anything. It takes frames of any size and any number.
+   from which the confidence is made. Where no photo shows anything, the render stays, with confidence 0. It takes frames of
+   any size and any number.
    Weights are f32, bf16, f16, or 8-bit integers with a factor per output:
    NAME.weight as I8 with NAME.weight_scale, the layout of compressed-tensors. A host embeds it in three lines:
        gsf_nn_mini_desc desc = {0};
@@ -15791,7 +15792,8 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
    The output is their mean by a softmax of weights, so that the colours are those of photos, and the network has to find
    only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made,
    and the error of the render. Where the latter is below that of renders of 35 dB the render stays as it is (gsf__mini_gate):
-   weights of a softmax are never 0, and small changes everywhere would spoil what is good already.
+   weights of a softmax are never 0, and small changes everywhere would spoil what is good already. What the network paints
+   where no reference shows anything (its training asks for that, too) is not used: gsf__mini_write.
 
        planes of each reference -> unshuffle 2 -> 1x1 -> 3x3 -> features --+--> mean by softmax, maximum --+
                                                                             |                              v
@@ -16484,19 +16486,21 @@ static gsf_result gsf__mini_fit(gsf_context* ctx, gsf__mini_restorer* r, int64_t
     return GSF_OK;
 }
 
-// Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b; 0
-// where no reference shows anything, since splats that train on a guess make the render of the next guess.
+// Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b. Where
+// no reference shows anything, the render stays, with weight 0: guesses make it worse, and splats that train on them make the
+// render of the next guess.
 static void gsf__mini_write(const gsf__mini_restorer* r, const float* shown, const gsf_image* color,
                             const gsf_image* confidence) {
-    const float square = r->desc.sigma * r->desc.sigma;
+    const float square = r->desc.sigma * r->desc.sigma, *frame = r->planes;
     const int64_t plane = color->width * color->height * GSF__MINI_REFERENCE;
     for (int64_t y = 0; y < color->height; y++) {
-        const float *out = r->run.out + 3 * y * r->run.width, *error = r->run.error + y * r->run.width;
+        const float *restored = r->run.out + 3 * y * r->run.width, *error = r->run.error + y * r->run.width;
         char *to = (char*)color->data + y * color->stride_y, *weight = (char*)confidence->data + y * confidence->stride_y;
-        for (int64_t x = 0; x < color->width; x++, shown += GSF__MINI_REFERENCE) {
+        for (int64_t x = 0; x < color->width; x++, shown += GSF__MINI_REFERENCE, frame += GSF__MINI_FRAME) {
             const int known = gsf__mini_shows(shown, r->desc.references, plane);
+            const float* out = known ? restored + 3 * x : frame;
             for (int64_t c = 0; c < 3; c++)
-                *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) = gsf__mini_clamp(out[3 * x + c], 0.0f, 1.0f);
+                *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) = gsf__mini_clamp(out[c], 0.0f, 1.0f);
             *(float*)(void*)(weight + x * confidence->stride_x) = known ? square / (square + expf(2.0f * error[x])) : 0.0f;
         }
     }

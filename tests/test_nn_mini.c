@@ -506,6 +506,7 @@ static void test_restorer(gsf_context* ctx) {
     score[0] = score[2] = back_ratio[1] = back_ratio[2] = 0.0f;
     run_restorer(ctx, &mini, &hidden, GSF_OK, 1);
     for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)hidden.weight[i], i == 2 ? 0.0 : weight, 1e-6); // nothing shows pixel 2
+    for (int i = 0; i < PIXELS; i++) CHECK((memcmp(hidden.out + 3 * i, hidden.color + 3 * i, 12) == 0) == (i == 2));
     run_restorer(ctx, &mini, &c, GSF_ERROR_UNSUPPORTED, 0);
     gsf_destroy_restorer(ctx, &mini);
     CHECK_OK(ctx, gsf_read_file(ctx, made_path(), &bytes, &size));
