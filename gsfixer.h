@@ -469,6 +469,8 @@ typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
                                     // lambda_views / photos. 0: the same for any number
     float frame_scale;              // preferred sides of the frames to train on, as a share of the photos', used by default
                                     // unless `squash` is set; 0: as large as the photos
+    float warp_weight;              // preferred weight of the frames of `warp` (gsfixer_splat.h) that the loop mixes with
+                                    // its own, which have 1, used by default; 0: none
 } gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on

@@ -652,6 +652,9 @@ typedef struct gsf_fix_desc {
                                   // pixels that the references explain; 0 = never skip
     float frame_scale;            // sides of the frames as a share of the photos', at most 1, default what the restorer
                                   // prefers, or 1. Not used if the restorer has a frame size of its own (limits.squash)
+    float warp_weight;            // the loop's frames are the mean of the restorer's, with the weight 1, and those of `warp`,
+                                  // with this one, each times the confidence of the pixel; default what the restorer
+                                  // prefers, or 0; negative = 0. Not used if the restorer explains (`warp` does)
     int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
                                   // accepts smaller ones; 0 = no limit
     float auto_exposure;          // share of the exposure that the photos' camera would have chosen for a frame of
@@ -14350,7 +14353,7 @@ typedef struct gsf__kept_frames {
 struct gsf_fixer {
     gsf_fix_desc desc;              // with defaults filled in
     const gsf_restorer* restorer;
-    gsf_restorer explain;           // internal warp for the skip test, made only if the restorer does not explain
+    gsf_restorer explain;           // internal warp for the skip test and to be mixed in, if the restorer does not explain
     gsf_trainer* trainer;
     size_t view_count;
     gsf_camera* cameras;
@@ -14363,6 +14366,7 @@ struct gsf_fixer {
     int32_t* reference_index;
     int references_open;
     gsf_image *rendered, *depth, *alpha, *restored, *confidence; // frames of one window
+    gsf_image *warped, *warped_confidence;                       // those of the internal warp, if they are mixed in
     gsf__kept_frames pending;       // frames of this round so far; those in training are trainer->restored
     gsf_restorer_info limits;
     // What carries photos into frames, for restorers that ask for it. The rest is empty unless one does.
@@ -14379,7 +14383,8 @@ static void gsf__drop_frames(gsf_context* ctx, gsf__kept_frames* list) {
 }
 
 static void gsf__drop_window(gsf_context* ctx, gsf_fixer* f) {
-    gsf_image** const sets[] = {&f->rendered, &f->depth, &f->alpha, &f->restored, &f->confidence};
+    gsf_image** const sets[] = {&f->rendered,   &f->depth,  &f->alpha,            &f->restored,
+                                &f->confidence, &f->warped, &f->warped_confidence};
     for (size_t s = 0; s < GSF__COUNT(sets); s++) {
         for (int32_t i = 0; *sets[s] && i < f->frames; i++) gsf_destroy_image(ctx, *sets[s] + i);
         gsf_free(ctx, *sets[s]);
@@ -14439,6 +14444,7 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     d.lambda = gsf__or_zero(d.lambda, 1.0f);
     if (d.frame_scale == 0.0f) d.frame_scale = 1.0f;
+    d.warp_weight = gsf__or_zero(d.warp_weight, 0.0f);
     d.auto_exposure = gsf__or_zero(d.auto_exposure, 1.0f);
     return d;
 }
@@ -14456,8 +14462,9 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (!(d->frame_scale > 0.0f && d->frame_scale <= 1.0f) || d->max_pixels < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid frame_scale %g or max_pixels %d",
                         (double)d->frame_scale, (int)d->max_pixels);
-    if (!(d->auto_exposure >= 0.0f && d->auto_exposure <= 1.0f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid auto_exposure %g", (double)d->auto_exposure);
+    if (!(d->auto_exposure >= 0.0f && d->auto_exposure <= 1.0f) || !(d->warp_weight >= 0.0f && d->warp_weight <= 1e6f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid auto_exposure %g or warp_weight %g",
+                        (double)d->auto_exposure, (double)d->warp_weight);
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
@@ -14619,8 +14626,12 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
         if (f->limits.lambda > 0.0f && f->limits.lambda <= 1e6f) f->desc.lambda = f->limits.lambda;
         if (few > 0.0f && (float)view_count > few) f->desc.lambda *= few / (float)view_count;
     }
+    if (desc->warp_weight == 0.0f && f->limits.warp_weight > 0.0f && f->limits.warp_weight <= 1e6f)
+        f->desc.warp_weight = f->limits.warp_weight;
+    if (f->limits.explains) f->desc.warp_weight = 0.0f;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
-    if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
+    if (result == GSF_OK && f->desc.rounds > 0 && !f->limits.explains &&
+        (f->desc.skip_psnr > 0.0f || f->desc.warp_weight > 0.0f))
         result = gsf_splat_make_warp(ctx, &f->explain);
     if (result == GSF_OK && gsf__carries(f)) result = gsf__keep_points(ctx, f, initial);
 cleanup:
@@ -14665,7 +14676,8 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     GSF__TRY(gsf__sample_path(ctx, f));
     for (int32_t i = 0; i < f->desc.windows * f->frames; i++) f->path[i] = gsf__frame_camera(f, f->path + i);
 
-    gsf_image** const sets[] = {&f->rendered, &f->depth, &f->alpha, &f->restored, &f->confidence};
+    gsf_image** const sets[] = {&f->rendered,   &f->depth,  &f->alpha,            &f->restored,
+                                &f->confidence, &f->warped, &f->warped_confidence};
     for (size_t s = 0; s < GSF__COUNT(sets); s++) {
         *sets[s] = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)f->frames, sizeof(gsf_image));
         if (!*sets[s]) return GSF_ERROR_OUT_OF_MEMORY;
@@ -14791,18 +14803,40 @@ static double gsf__window_agreement(const gsf_restore_window* window) {
     return error > 0.0 ? -10.0 * log10(error / weight) : (double)INFINITY;
 }
 
+// Mixes the frames of the internal warp into those of the restorer: two that err in different ways err less together.
+static void gsf__mix_warped(const gsf_fixer* f, const gsf_restore_window* window) {
+    const float weight = f->desc.warp_weight;
+    for (int32_t i = 0; i < window->frame_count; i++) {
+        gsf_image *color = window->out_color + i, *confidence = window->out_confidence + i;
+        for (int64_t y = 0; y < color->height; y++)
+            for (int64_t x = 0; x < color->width; x++) {
+                const float own = gsf__get_pixel(confidence, x, y, 0);
+                const float warped = weight * gsf__get_pixel(f->warped_confidence + i, x, y, 0), sum = own + warped;
+                gsf__put_pixel(confidence, x, y, 0, sum / (1.0f + weight));
+                for (int c = 0; c < 3 && warped > 0.0f; c++) {
+                    const float value = own * gsf__get_pixel(color, x, y, c) + warped * gsf__get_pixel(f->warped + i, x, y, c);
+                    gsf__put_pixel(color, x, y, c, value / sum);
+                }
+            }
+    }
+}
+
 // Restores the window, or skips it (*skip = 1) if its render already agrees with the photos.
 static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, const gsf_restore_window* window, int* skip) {
+    const int mixed = f->desc.warp_weight > 0.0f;
     *skip = 0;
-    if (f->desc.skip_psnr > 0.0f) {
+    if (f->desc.skip_psnr > 0.0f || mixed) {
         const gsf_restorer* explain = f->limits.explains ? f->restorer : &f->explain;
         gsf_restore_window shared = *window; // the internal warp uses the loop's carrier, whatever the restorer asks for
         if (gsf__carries(f)) shared.carry_fn = gsf__carry_for_window;
+        if (mixed) shared.out_color = f->warped, shared.out_confidence = f->warped_confidence;
         GSF__TRY(explain->restore_fn(explain->user, ctx, &shared));
-        *skip = gsf__window_agreement(window) >= (double)f->desc.skip_psnr;
+        *skip = f->desc.skip_psnr > 0.0f && gsf__window_agreement(&shared) >= (double)f->desc.skip_psnr;
         if (*skip || f->limits.explains) return GSF_OK;
     }
-    return f->restorer->restore_fn(f->restorer->user, ctx, window);
+    GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, window));
+    if (mixed) gsf__mix_warped(f, window);
+    return GSF_OK;
 }
 
 // Appends a frame. pixels: its bytes, NULL = to be filled in by the caller.
@@ -14870,6 +14904,10 @@ static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_c
         if (f->limits.needs_alpha) GSF__TRY(gsf__fit_image(ctx, f->alpha + i, camera, 1));
         GSF__TRY(gsf__fit_image(ctx, f->restored + i, camera, 3));
         GSF__TRY(gsf__fit_image(ctx, f->confidence + i, camera, 1));
+        if (f->desc.warp_weight > 0.0f) {
+            GSF__TRY(gsf__fit_image(ctx, f->warped + i, camera, 3));
+            GSF__TRY(gsf__fit_image(ctx, f->warped_confidence + i, camera, 1));
+        }
         gsf_render_output out;
         memset(&out, 0, sizeof out);
         out.color = f->rendered[i];

@@ -83,6 +83,7 @@ static const setting settings[] = {
     {"lambda", SET_REAL, FIX_AT(lambda), -1, 1000},
     {"skip_psnr", SET_REAL, FIX_AT(skip_psnr), 0, 1000},
     {"frame_scale", SET_REAL, FIX_AT(frame_scale), 0, 1},
+    {"warp_weight", SET_REAL, FIX_AT(warp_weight), -1, 1e6},
     {"max_pixels", SET_WHOLE, FIX_AT(max_pixels), 0, 1e9},
     {"dense_points", SET_COUNT, DENSE_AT(max_points), 1, 1e8},
     {"dense_spacing", SET_WHOLE, DENSE_AT(spacing), 0, 10000},

@@ -407,7 +407,7 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"last_round", "Repair", NULL, "<step "}, {"windows", "Repair", NULL, " per round"},
     {"window_frames", "Repair", NULL, ""}, {"lambda", "Repair", NULL, " at the end"},
     {"skip_psnr", "Repair", "never", " dB"}, {"frame_scale", "Repair", NULL, " of a photo's sides"},
-    {"max_pixels", "Repair", "no limit", ""},
+    {"warp_weight", "Repair", "no frames of warp", " of frames of warp"}, {"max_pixels", "Repair", "no limit", ""},
     {"densify_until", "Training", "never", "<step "}, {"densify_from", "Training", NULL, "<step "},
     {"densify_interval", "Training", NULL, " steps"}, {"sh_interval", "Training", NULL, " steps"},
     {"opacity_reset_interval", "Training", "never", " steps"}, {"lambda_ssim", "Training", "no SSIM term", ""},

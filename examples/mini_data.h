@@ -56,6 +56,7 @@ static gsf_result probe_query(void* user, gsf_context* ctx, int32_t frames, int3
     const gsf_result result = own ? own->query_fn(own->user, ctx, frames, width, height, out) : GSF_OK;
     out->needs_depth = out->needs_alpha = 1;
     out->needs_carried = DATA_REFERENCES;
+    out->warp_weight = 0.0f; // as when the weights in examples/models were trained
     return result;
 }
 

@@ -48,6 +48,7 @@ gsfixer_splat.h|test_scene|undistortion: tangential terms swapped|s/\*u = x \* s
 gsfixer_nn.h|golden_restorer|RoPE: frequencies of the next pair|s/exponent = \(float\)k \/ \(float\)dim/exponent = (float)(k + 2) \/ (float)dim/
 gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s/m \+ 4 \* d, m \+ 3 \* d/m + d, m/
 gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
+gsfixer_splat.h|test_fixer|frames of warp are mixed in whatever their confidence|s/weight \* gsf__get_pixel\(f->warped_confidence \+ i, x, y, 0\)/weight/
 gsfixer_nn.h|test_nn_mini|mini: guesses are trained on where no photo shows anything|s/const int known = gsf__mini_shows\(shown, r->desc\.references, plane\)/const int known = 1/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
 gsfixer_nn.h|test_nn_training|gradients: SiLU without its second term|s/return s \* \(1\.0 \+ x \* \(1\.0 - s\)\);/return s;/

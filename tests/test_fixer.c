@@ -335,6 +335,7 @@ static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int
     out->lambda = r->also.lambda;
     out->lambda_views = r->also.lambda_views;
     out->frame_scale = r->also.frame_scale;
+    out->warp_weight = r->also.warp_weight;
     out->needs_depth = out->needs_alpha = 1;
     return GSF_OK;
 }
@@ -903,6 +904,10 @@ static void test_trouble(gsf_context* ctx) {
                      GSF_ERROR_INVALID_ARGUMENT);
     }
     desc = repair_desc();
+    desc.warp_weight = NAN;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
+                 GSF_ERROR_INVALID_ARGUMENT);
+    desc = repair_desc();
     r.restorer.end_fn = NULL;
     CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
                  GSF_ERROR_INVALID_ARGUMENT);
@@ -1036,6 +1041,65 @@ static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int sk
     return fixer;
 }
 
+// A frame of the first window by a restorer that prefers a weight of `warp`, with that of the desc.
+static void mixed_frame(gsf_context* ctx, repair* r, float preferred, float weight, float skip_psnr, float* color,
+                        float* confidence) {
+    enum { FRAME = 4 };
+    gsf_fix_desc desc = repair_desc();
+    gsf_fixer* fixer;
+    gsf_fix_stats stats;
+    desc.train.iterations = 12;
+    desc.rounds = 1;
+    desc.first_round = desc.last_round = 3;
+    desc.skip_psnr = skip_psnr;
+    desc.warp_weight = weight;
+    r->also.warp_weight = preferred;
+    if (!CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r->views, VIEWS, &r->start, &r->restorer, &fixer))) return;
+    for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_RESTORE;)
+        if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) break;
+    if (CHECK(stats.stage == GSF_FIX_RESTORE && stats.restored && stats.restored[FRAME].width == WIDTH &&
+              stats.restored[FRAME].height == HEIGHT)) {
+        memcpy(color, stats.restored[FRAME].data, 3 * PIXELS * sizeof *color);
+        memcpy(confidence, stats.confidence[FRAME].data, PIXELS * sizeof *confidence);
+    }
+    gsf_splat_destroy_fixer(ctx, fixer);
+}
+
+// Frames of `warp` are mixed into the restorer's, by weight and confidence.
+static void test_mixed_warp(gsf_context* ctx) {
+    static const struct { float preferred, weight, skip_psnr, used; } cases[] = {
+        {0.25f, 0.0f, 0.0f, 0.25f}, {0.25f, 0.0f, 100.0f, 0.25f}, {0.25f, 2.0f, 0.0f, 2.0f}, {0.25f, -1.0f, 100.0f, 0.0f},
+    };
+    static repair r;
+    static float own[4 * PIXELS], warped[4 * PIXELS], out[4 * PIXELS]; // colours, then confidences
+    repair_setup(ctx, &r);
+    mixed_frame(ctx, &r, 0.0f, 0.0f, 0.0f, own, own + 3 * PIXELS);
+    mixed_frame(ctx, &r, 0.0f, 1e6f, 0.0f, warped, warped + 3 * PIXELS);
+    int known = 0, sure = 0, differ = 0;
+    for (int i = 0; i < PIXELS; i++) {
+        known += warped[3 * PIXELS + i] > 0.01f;
+        sure += warped[3 * PIXELS + i] > 0.99f;
+        differ += fabsf(warped[3 * i] - own[3 * i]) > 0.02f;
+        CHECK(own[3 * PIXELS + i] == 0.8f);
+    }
+    printf("warp: %d of %d pixels known, %d surely, %d unlike the truth\n", known, PIXELS, sure, differ);
+    CHECK(known > PIXELS / 4 && sure < known / 2 && differ > PIXELS / 20);
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        const float w = cases[k].used;
+        double worst = 0.0;
+        mixed_frame(ctx, &r, cases[k].preferred, cases[k].weight, cases[k].skip_psnr, out, out + 3 * PIXELS);
+        for (int i = 0; i < PIXELS; i++) {
+            const float part = w * warped[3 * PIXELS + i], sum = 0.8f + part;
+            worst = fmax(worst, fabs((double)(out[3 * PIXELS + i] - sum / (1.0f + w))));
+            for (int c = 3 * i; c < 3 * i + 3; c++)
+                worst = fmax(worst, fabs((double)(out[c] - (0.8f * own[c] + part * warped[c]) / sum)));
+        }
+        CHECK_NEAR(worst, 0.0, 1e-5);
+        if (w == 0.0f) CHECK(memcmp(out, own, sizeof own) == 0);
+    }
+    repair_teardown(ctx, &r);
+}
+
 static void test_mixed_windows(gsf_context* ctx) {
     static repair r;
     mixed_setup(ctx, &r);
@@ -1151,6 +1215,7 @@ int main(void) {
     test_seen_mask(&ctx);
     test_desc(&ctx);
     test_masked_references(&ctx);
+    test_mixed_warp(&ctx);
     test_mixed_windows(&ctx);
     test_explaining_restorer(&ctx);
     test_loop(&ctx);
