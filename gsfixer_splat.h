@@ -103,7 +103,8 @@
                again for `warp` until its first window), and until the run ends 4 bytes per pixel of their depth maps, at
                most 320 pixels long; a frame takes 4 bytes per pixel and reference, 52 more if it is handed out. Stereo, once
                per run, takes 80 bytes per pixel of its working size while it runs.
-               A restored frame takes 7 bytes per pixel while it is trained on.
+               A restored frame takes 7 bytes per pixel while it is trained on; one of `warp` that is mixed in takes 16 until
+               the round ends.
                Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
