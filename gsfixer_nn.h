@@ -16431,7 +16431,7 @@ static gsf_result gsf__mini_query(void* user, gsf_context* ctx, int32_t frame_co
     out->needs_carried = r->desc.references;
     out->lambda = 2.0f; // its frames are worth more than the photos' weight: measured in bench/TRIED.md
     out->lambda_views = 3;
-    out->warp_weight = 0.25f;
+    out->warp_weight = 0.25f; // likewise
     memset(&run, 0, sizeof run);
     run.net = &r->net;
     run.batch = 1;
