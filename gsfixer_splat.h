@@ -14383,13 +14383,20 @@ static void gsf__drop_frames(gsf_context* ctx, gsf__kept_frames* list) {
     memset(list, 0, sizeof *list);
 }
 
+enum { GSF__WINDOW_IMAGES = 7 }; // arrays of a window's frames
+
+static gsf_image** gsf__window_images(gsf_fixer* f, int32_t i) {
+    gsf_image** const arrays[GSF__WINDOW_IMAGES] = {&f->rendered,   &f->depth,  &f->alpha,            &f->restored,
+                                                    &f->confidence, &f->warped, &f->warped_confidence};
+    return arrays[i];
+}
+
 static void gsf__drop_window(gsf_context* ctx, gsf_fixer* f) {
-    gsf_image** const sets[] = {&f->rendered,   &f->depth,  &f->alpha,            &f->restored,
-                                &f->confidence, &f->warped, &f->warped_confidence};
-    for (size_t s = 0; s < GSF__COUNT(sets); s++) {
-        for (int32_t i = 0; *sets[s] && i < f->frames; i++) gsf_destroy_image(ctx, *sets[s] + i);
-        gsf_free(ctx, *sets[s]);
-        *sets[s] = NULL;
+    for (int32_t k = 0; k < GSF__WINDOW_IMAGES; k++) {
+        gsf_image** images = gsf__window_images(f, k);
+        for (int32_t i = 0; *images && i < f->frames; i++) gsf_destroy_image(ctx, *images + i);
+        gsf_free(ctx, *images);
+        *images = NULL;
     }
 }
 
@@ -14676,12 +14683,10 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     gsf__drop_window(ctx, f);
     GSF__TRY(gsf__sample_path(ctx, f));
     for (int32_t i = 0; i < f->desc.windows * f->frames; i++) f->path[i] = gsf__frame_camera(f, f->path + i);
-
-    gsf_image** const sets[] = {&f->rendered,   &f->depth,  &f->alpha,            &f->restored,
-                                &f->confidence, &f->warped, &f->warped_confidence};
-    for (size_t s = 0; s < GSF__COUNT(sets); s++) {
-        *sets[s] = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)f->frames, sizeof(gsf_image));
-        if (!*sets[s]) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t k = 0; k < GSF__WINDOW_IMAGES; k++) {
+        gsf_image** images = gsf__window_images(f, k);
+        *images = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)f->frames, sizeof(gsf_image));
+        if (!*images) return GSF_ERROR_OUT_OF_MEMORY;
     }
     f->planned = 1;
     return GSF_OK;
