@@ -52,6 +52,7 @@ static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t 
     read.memory = memory;
     read.part = size / (size_t)ctx->threads / 512 * 512;
     read.passes = 1;
+    read.kind = SWEEP_FETCH; // the fastest where memory exceeds the caches
     return read;
 }
 
