@@ -178,16 +178,15 @@ static inline double bench_peak_rate(int json, gsf_context* ctx, const char* nam
 // ---- memory: a sweep over a buffer, each thread over its part --------------------------
 
 typedef enum bench_sweep_kind {
-    SWEEP_READ, SWEEP_FETCH, SWEEP_UPDATE, SWEEP_COPY, SWEEP_STREAM, SWEEP_KINDS
+    SWEEP_READ, SWEEP_READ_ROWS, SWEEP_UPDATE, SWEEP_COPY, SWEEP_STREAM, SWEEP_KINDS
 } bench_sweep_kind;
-enum { SWEEP_AHEAD = 2048 }; // bytes by which SWEEP_FETCH asks for memory before it reads it: on Sapphire Rapids 5 % faster
+enum { SWEEP_ROW = 4096 }; // bytes; SWEEP_READ_ROWS reads four rows side by side: on Sapphire Rapids 12 % faster than one
 
 typedef struct bench_sweep {
     char* memory;    // 64-byte aligned
-    size_t part;     // bytes per thread, a multiple of 512
+    size_t part;     // bytes per thread, a multiple of 4 SWEEP_ROW
     int passes;      // consecutive passes over the part
-    bench_sweep_kind kind; // read, also with prefetches; update in place; copy the first half to the second, through the
-                           // caches or streaming
+    bench_sweep_kind kind; // read; update in place; copy the first half to the second, through the caches or streaming
     float sums[2 * 16];
 } bench_sweep;
 
@@ -206,14 +205,14 @@ typedef struct bench_sweep {
                 c = XOR(c, LOAD(p + i + 2 * sizeof(V)));                                                                 \
                 d = XOR(d, LOAD(p + i + 3 * sizeof(V)));                                                                 \
             }                                                                                                            \
-        else if (job->kind == SWEEP_FETCH)                                                                               \
-            for (size_t i = 0; i < job->part; i += 4 * sizeof(V)) {                                                      \
-                for (size_t k = 0; k < 4 * sizeof(V); k += 64) __builtin_prefetch(p + i + SWEEP_AHEAD + k, 0, 2);        \
-                a = XOR(a, LOAD(p + i));                                                                                 \
-                b = XOR(b, LOAD(p + i + sizeof(V)));                                                                     \
-                c = XOR(c, LOAD(p + i + 2 * sizeof(V)));                                                                 \
-                d = XOR(d, LOAD(p + i + 3 * sizeof(V)));                                                                 \
-            }                                                                                                            \
+        else if (job->kind == SWEEP_READ_ROWS)                                                                           \
+            for (size_t q = 0; q < job->part; q += 4 * SWEEP_ROW)                                                        \
+                for (size_t i = q; i < q + SWEEP_ROW; i += sizeof(V)) {                                                  \
+                    a = XOR(a, LOAD(p + i));                                                                             \
+                    b = XOR(b, LOAD(p + i + SWEEP_ROW));                                                                 \
+                    c = XOR(c, LOAD(p + i + 2 * SWEEP_ROW));                                                             \
+                    d = XOR(d, LOAD(p + i + 3 * SWEEP_ROW));                                                             \
+                }                                                                                                        \
         else if (job->kind == SWEEP_UPDATE)                                                                              \
             for (size_t i = 0; i < job->part; i += 2 * sizeof(V)) {                                                      \
                 STORE(p + i, XOR(a, LOAD(p + i)));                                                                       \

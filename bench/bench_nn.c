@@ -50,9 +50,9 @@ static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t 
     bench_sweep read;
     memset(&read, 0, sizeof read);
     read.memory = memory;
-    read.part = size / (size_t)ctx->threads / 512 * 512;
+    read.part = size / (size_t)ctx->threads / (4 * SWEEP_ROW) * (4 * SWEEP_ROW);
     read.passes = 1;
-    read.kind = SWEEP_FETCH; // the fastest where memory exceeds the caches
+    read.kind = SWEEP_READ_ROWS; // the fastest where memory exceeds the caches
     return read;
 }
 
