@@ -52,7 +52,6 @@ static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t 
     read.memory = memory;
     read.part = size / (size_t)ctx->threads / (4 * SWEEP_ROW) * (4 * SWEEP_ROW);
     read.passes = 1;
-    read.kind = SWEEP_READ_ROWS; // the fastest where memory exceeds the caches
     return read;
 }
 
