@@ -4348,52 +4348,35 @@ GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // si
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
 }
 
-// One row of weights times one row of x: sequential reads suit the hardware prefetcher. `count` is a multiple of 32.
-GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
-    const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
-    __m512 s0 = _mm512_setzero_ps(), s1 = s0, s2 = s0, s3 = s0;
-    for (; count >= 64; count -= 64, x += 64, w += 4 * vector) {
-        s0 = _mm512_fmadd_ps(gsf__load16(w, dtype), _mm512_load_ps(x), s0);
-        s1 = _mm512_fmadd_ps(gsf__load16(w + vector, dtype), _mm512_load_ps(x + 16), s1);
-        s2 = _mm512_fmadd_ps(gsf__load16(w + 2 * vector, dtype), _mm512_load_ps(x + 32), s2);
-        s3 = _mm512_fmadd_ps(gsf__load16(w + 3 * vector, dtype), _mm512_load_ps(x + 48), s3);
-    }
-    if (count > 0) {
-        s0 = _mm512_fmadd_ps(gsf__load16(w, dtype), _mm512_load_ps(x), s0);
-        s1 = _mm512_fmadd_ps(gsf__load16(w + vector, dtype), _mm512_load_ps(x + 16), s1);
-    }
-    return gsf__v_sum_avx512((s0 + s1) + (s2 + s3));
-}
-
-// Four rows of weights times two rows of x, laid out as [k / 16][2][16], added to sums[4][2]. `count` is a multiple of
-// 32. The more arithmetic per load, the less far the hardware runs ahead, so this prefetches `ahead` bytes ahead.
-GSF__INLINE_AVX512 void gsf__gemv_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x,
-                                        int64_t count, float* sums) {
+// Four rows of weights times one or two rows of x, laid out as [k / 16][rows][16], added to sums[4][rows]. `count` is a
+// multiple of 32. The more arithmetic per load, the less far the hardware runs ahead, so this prefetches `ahead` bytes ahead.
+GSF__INLINE_AVX512 void gsf__gemv_four16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                         int64_t rows, int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3)
 #define GSF_X(r) __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, t##r##0 = s##r##0, t##r##1 = s##r##0;
     GSF_ROWS(GSF_X)
 #undef GSF_X
-    for (int64_t at = 0; count > 0; count -= 32, at += 2 * vector, x += 64) {
-        const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
-        const __m512 y0 = _mm512_load_ps(x + 32), y1 = _mm512_load_ps(x + 48);
+    for (int64_t at = 0; count > 0; count -= 32, at += 2 * vector, x += 32 * rows) {
+        const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16 * (rows - 1)); // the same if there is one row
+        const __m512 y0 = _mm512_load_ps(x + 16 * rows), y1 = _mm512_load_ps(x + 32 * rows - 16);
         __m512 v;
 #define GSF_X(r)                                                                \
         _mm_prefetch(w##r + at + ahead, _MM_HINT_T0);                           \
         v = gsf__load16(w##r + at, dtype);                                      \
         s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);                              \
-        s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);                              \
+        if (rows == 2) s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);               \
         if (vector == 64) _mm_prefetch(w##r + at + ahead + 64, _MM_HINT_T0);    \
         v = gsf__load16(w##r + at + vector, dtype);                             \
         t##r##0 = _mm512_fmadd_ps(v, y0, t##r##0);                              \
-        t##r##1 = _mm512_fmadd_ps(v, y1, t##r##1);
+        if (rows == 2) t##r##1 = _mm512_fmadd_ps(v, y1, t##r##1);
         GSF_ROWS(GSF_X)
 #undef GSF_X
     }
-#define GSF_X(r)                                           \
-    sums[2 * r] += gsf__v_sum_avx512(s##r##0 + t##r##0);       \
-    sums[2 * r + 1] += gsf__v_sum_avx512(s##r##1 + t##r##1);
+#define GSF_X(r)                                                            \
+    sums[rows * r] += gsf__v_sum_avx512(s##r##0 + t##r##0);                 \
+    if (rows == 2) sums[2 * r + 1] += gsf__v_sum_avx512(s##r##1 + t##r##1);
     GSF_ROWS(GSF_X)
 #undef GSF_X
 #undef GSF_ROWS
@@ -4440,7 +4423,7 @@ GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dty
 // next ones prefetched.
 GSF__INLINE_AVX512 void gsf__gemv16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
                                     int64_t column, int64_t columns, float* sums, int64_t pitch) {
-    const int64_t taken = rows == 1 ? 1 : rows == 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
+    const int64_t taken = rows <= 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
     const int streams = rows <= 2 || size == 4;
     const int64_t apart = streams ? turns : 1, next = streams ? 1 : taken;
     const int64_t step = streams ? job->in : (int64_t)GSF__GEMV_STEP;
@@ -4468,8 +4451,7 @@ GSF__INLINE_AVX512 void gsf__gemv16(const gsf__linear_job* job, gsf_nn_dtype dty
                     memcpy(tails[r], w[r] + (size_t)whole * size, left);
                     w[r] = tails[r];
                 }
-                if (rows == 1) tile[0] += gsf__gemv_one16(w[0], dtype, x, n);
-                else if (rows == 2) gsf__gemv_two16(w, dtype, ahead, x, n, tile);
+                if (rows <= 2) gsf__gemv_four16(w, dtype, ahead, x, rows, n, tile);
                 else gsf__gemv_six16(w, dtype, ahead, x, n, tile);
             }
             for (int64_t r = 0; r < taken && turn * next + r * apart < columns; r++)
