@@ -4116,12 +4116,15 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
     const float* p[GSF__TILE_ROWS];
     int64_t step[GSF__TILE_ROWS]; // all bits set, or 0 for a missing row
     const int64_t whole = count & ~(int64_t)7;
+    const float* ahead = x + GSF__TILE_ROWS * ldx; // usually the next group, in rows too short to be foreseen
     float* to = out;
     for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
         p[r] = r < rows ? x + r * ldx : zeros;
         step[r] = r < rows ? -1 : 0;
     }
     for (int64_t k = 0; k < whole; k += 8, to += 8 * GSF__TILE_ROWS) {
+        for (int64_t i = 0; i < GSF__TILE_ROWS && !(k & 8); i++)
+            _mm_prefetch((const char*)(ahead + i * ldx + k), _MM_HINT_T1);
         __m256 r[8] = {_mm256_loadu_ps(p[0] + (k & step[0])), _mm256_loadu_ps(p[1] + (k & step[1])),
                        _mm256_loadu_ps(p[2] + (k & step[2])), _mm256_loadu_ps(p[3] + (k & step[3])),
                        _mm256_loadu_ps(p[4] + (k & step[4])), _mm256_loadu_ps(p[5] + (k & step[5])),
