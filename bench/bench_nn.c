@@ -50,7 +50,7 @@ static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t 
     bench_sweep read;
     memset(&read, 0, sizeof read);
     read.memory = memory;
-    read.part = size / (size_t)ctx->threads / (4 * SWEEP_ROW) * (4 * SWEEP_ROW);
+    read.part = size / (size_t)ctx->threads / SWEEP_STEP * SWEEP_STEP;
     read.passes = 1;
     return read;
 }
