@@ -45,14 +45,13 @@ static int bench_wanted(const bench_options* o, const char* name, int threads) {
 
 // ---- peaks of the machine -------------------------------------------------------
 
-// Reads `size` bytes of `memory` once, in the fastest way.
-static bench_sweep bench_make_read(gsf_context* ctx, char* memory, size_t size) {
+// Reads `size` bytes of `memory` once.
+static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t size) {
     bench_sweep read;
     memset(&read, 0, sizeof read);
     read.memory = memory;
     read.part = size / (size_t)ctx->threads / SWEEP_STEP * SWEEP_STEP;
     read.passes = 1;
-    bench_choose_way(ctx, &read);
     return read;
 }
 
@@ -181,12 +180,13 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
 typedef void (*bench_body)(gsf_context* ctx, void* arg);
 
 // One warm-up round, then at least three rounds, for about a second (quick: 0.2 s). Each runs `repeats` units of the
-// row. If `read` is set, that memory is read before each round and the row's bandwidth is relative to the bandwidth of
-// these reads: other users of the memory bus then affect both alike.
+// row. If `read` is set, that memory is read before each round, in the fastest way, and the row's bandwidth is relative to
+// the bandwidth of these reads: other users of the memory bus then affect both alike.
 static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
                               double repeats, bench_sweep* read) {
     enum { MOST = 101 };
     double wall[MOST], cpu[MOST], share[MOST], cpu_share[MOST];
+    if (read) bench_choose_way(ctx, read);
     const double start = bench_now(), budget = o->quick ? 0.3 : read ? 3.0 : 1.5;
     int rounds = -1;
     while (rounds < MOST && (rounds < 3 || bench_now() - start < budget)) {
