@@ -145,6 +145,8 @@ typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped 
     int32_t grid;                // patches along a side of the training images
     double norm_eps;
     gsf_nn_weights weights;
+    int32_t bf16;                // products in bfloat16, for speed: see GSF_CPU_AVX512_BF16 and AMX. Operands of any type
+                                 // are rounded, sums and all else stay float32. May be changed at any time
     void* nets;                  // private
 } gsf_nn_dinov2;
 
@@ -160,6 +162,7 @@ typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapp
     int32_t grid;                // patches along a side of the images that the embedding was trained with
     double rope_base;            // of the rotary embedding of q and k; 0: none
     gsf_nn_weights weights;
+    int32_t bf16;                // as gsf_nn_dinov2's
     void* nets;                  // private
 } gsf_nn_vggt;
 
@@ -297,6 +300,7 @@ typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped file
     int32_t buckets, max_distance;                  // of the relative position bias
     double norm_eps;
     gsf_nn_weights weights;
+    int32_t bf16;                                   // as gsf_nn_dinov2's
     void* nets;                                     // private
 } gsf_nn_t5;
 
@@ -576,7 +580,7 @@ typedef struct gsf_nn_dit_desc {
     int32_t keep_saved;      // keep and use what this file already holds, to continue a run; 0: replace the file
     gsf_nn_condition condition; // which reference tokens condition the model (the paper's ablation)
     int32_t int8;            // gsf_nn_quantize_transformer
-    int32_t bf16;            // gsf_nn_transformer.bf16
+    int32_t bf16;            // the member of that name of the transformer and the encoders
     const char* lora;        // NULL, or low-rank adapters for the transformer, as peft or train_restorer write them: a file
                              // or its folder (adapter_model.safetensors, adapter_config.json)
     gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are set per window
@@ -3780,11 +3784,11 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 // `depth`, so that this much of its rows fits the L2 cache and of one panel the L1 cache; each tile of 6 x 16 sums is
 // held in registers. AVX-512 computes two groups by two panels at a time, 12 x 32 sums, on request with pairs of bf16
 // in the place of floats, AMX such pairs of groups of 16 rows. After the last step the block goes through bias, activation,
-// gate and residual into y, row by row: y is often larger than the caches. The weights are packed once per call for all blocks,
-// or, if one block covers all rows, by the worker that needs them; x by each block or, where it would show, once per call: if
-// it is stored transposed, and for tiles of bf16. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they
-// are not packed but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the
-// result does not depend on the number of workers.
+// gate and residual into y, row by row: y is often larger than the caches. The weights are packed once per call for all
+// blocks, and x by each block; if one block covers all rows, x is packed once per call, and the weights by the worker that
+// needs them. x is also packed once if it is stored transposed, and for tiles of bf16. With up to 4 rows (GEMV) reading the
+// weights once is the bottleneck, so they are not packed but used as stored in the file. Each `depth` is summed by itself
+// and these sums are added in order, so the result does not depend on the number of workers.
 
 enum {
     GSF__TILE_ROWS = 6,
@@ -3822,7 +3826,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set; `count`: va
     void (*pack_weights)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
     // The same from weights that are stored transposed, `count` rows of `columns`
     void (*pack_transposed)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
-    // out[k][6]: `rows` rows of x, transposed; missing rows are zero; may write two floats more
+    // out[k][6]: `rows` rows of x, transposed; missing rows are zero
     void (*pack_rows)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
     // The same from x that is stored transposed, `count` rows of `rows`
     void (*pack_columns)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
@@ -3843,7 +3847,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set; `count`: va
     int64_t height;    // rows of a group: 6 or, as tiles, 16
     int64_t step;      // packed values come in multiples of this, filled up with zeros
     int64_t depth, rows, columns; // of a block, at most
-    int shares_x;      // x is packed once for all blocks, always; pack_rows must not write beyond its group
+    int shares_x;      // x is packed once for all blocks, always
     void (*enter)(void), (*leave)(void); // around the tiles of a unit of work, or NULL
 } gsf__linear_kernels;
 
@@ -4117,7 +4121,7 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
     int64_t step[GSF__TILE_ROWS]; // all bits set, or 0 for a missing row
     const int64_t whole = count & ~(int64_t)7;
     const float* ahead = x + GSF__TILE_ROWS * ldx; // usually the next group, in rows too short to be foreseen
-    float* to = out;
+    float *to = out, last[8 * GSF__TILE_ROWS + 2];
     for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
         p[r] = r < rows ? x + r * ldx : zeros;
         step[r] = r < rows ? -1 : 0;
@@ -4129,8 +4133,10 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
                        _mm256_loadu_ps(p[2] + (k & step[2])), _mm256_loadu_ps(p[3] + (k & step[3])),
                        _mm256_loadu_ps(p[4] + (k & step[4])), _mm256_loadu_ps(p[5] + (k & step[5])),
                        _mm256_setzero_ps(), _mm256_setzero_ps()};
-        gsf__nn_store_columns(r, to, GSF__TILE_ROWS); // each step's last two floats are overwritten by the next step
+        // writes two floats more, which the next step overwrites
+        gsf__nn_store_columns(r, k + 8 < whole ? to : last, GSF__TILE_ROWS);
     }
+    if (whole > 0) memcpy(to - 8 * GSF__TILE_ROWS, last, 8 * GSF__TILE_ROWS * sizeof *to);
     for (int64_t k = whole; k < count; k++)
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
 }
@@ -4553,7 +4559,7 @@ GSF__TARGET_BF16 static void gsf__pack_transposed_bf16(const char* w, gsf_nn_dty
 }
 
 GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
-    float units[8][16];
+    float units[8][16], last[8 * GSF__TILE_ROWS + 2];
     for (int64_t k = 0; k < count; k += 32, out += 16 * GSF__TILE_ROWS) {
         for (int64_t r = 0; r < 8; r++) {
             const int there = r < gsf__least(rows, GSF__TILE_ROWS);
@@ -4561,7 +4567,8 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
                                                         there ? count - k : 0));
         }
         gsf__nn_turn8(units[0], 16, out, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
-        gsf__nn_turn8(units[0] + 8, 16, out + 8 * GSF__TILE_ROWS, GSF__TILE_ROWS);
+        gsf__nn_turn8(units[0] + 8, 16, last, GSF__TILE_ROWS);
+        memcpy(out + 8 * GSF__TILE_ROWS, last, 8 * GSF__TILE_ROWS * sizeof *out);
     }
 }
 
@@ -4897,7 +4904,7 @@ static int gsf__plan_linear(const gsf__linear_kernels* kernels, int64_t rows, in
         const int64_t widest = plan->lone ? (int64_t)GSF__LINEAR_LONE_COLUMNS : kernels->columns;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
-        plan->shares_x = shares_x && plan->block_columns < out;
+        plan->shares_x = (shares_x || plan->lone) && plan->block_columns < out;
         const int64_t own = plan->shares_x ? 0 : plan->depth;
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + own) + GSF__TILE_COLUMNS);
         const int64_t fit = most / plan->block_rows * plan->block_rows; // whole blocks
@@ -8773,7 +8780,7 @@ static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gs
 
 // Runs either encoder; net NULL: the DINOv2 alone.
 static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_nn_weights* weights, const gsf__vit* vit,
-                                  const gsf__vggt* net, const gsf_nn_encoder_desc* in, float* out) {
+                                  const gsf__vggt* net, int32_t bf16, const gsf_nn_encoder_desc* in, float* out) {
     gsf__nn_run run;
     gsf__vit_plan plan;
     float* memory = NULL;
@@ -8782,6 +8789,7 @@ static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_
     run.ctx = ctx;
     run.name = run.stage = name;
     run.weights = weights;
+    run.bf16 = bf16 ? GSF__NN_BF16_ALL : 0;
     run.tap = in->_tap;
     gsf_result result = gsf__vit_open_run(&run, vit, net, in, &plan, &memory);
     if (!result) result = net ? gsf__vggt_run(&run, net, in, &plan, out) : gsf__dinov2_run(&run, vit, in, &plan, out);
@@ -8797,13 +8805,13 @@ static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_
 
 GSF_API gsf_result gsf_nn_encode_dinov2(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_desc* input,
                                         float* out) {
-    return gsf__vit_encode(ctx, "dinov2", &dinov2->weights, (const gsf__vit*)dinov2->nets, NULL, input, out);
+    return gsf__vit_encode(ctx, "dinov2", &dinov2->weights, (const gsf__vit*)dinov2->nets, NULL, dinov2->bf16, input, out);
 }
 
 GSF_API gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt, const gsf_nn_encoder_desc* input,
                                       float* out) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
-    return gsf__vit_encode(ctx, "vggt", &vggt->weights, &net->embed, net, input, out);
+    return gsf__vit_encode(ctx, "vggt", &vggt->weights, &net->embed, net, vggt->bf16, input, out);
 }
 
 // ---- image encoders: from photos to features
@@ -12110,6 +12118,7 @@ GSF_API gsf_result gsf_nn_encode_t5(gsf_context* ctx, const gsf_nn_t5* t5, const
     run.name = "t5";
     run.stage = "text";
     run.weights = &t5->weights;
+    run.bf16 = t5->bf16 ? GSF__NN_BF16_ALL : 0;
     run.tap = input->_tap;
     const size_t floats = gsf__t5_lay_out(&run, t5, input, &x, &bias, NULL);
     if (floats > SIZE_MAX / 16)
@@ -15155,8 +15164,13 @@ static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
     if (!result) result = vggt ? gsf_nn_load_vggt(p->ctx, folder.data, &deep) : gsf_nn_load_dinov2(p->ctx, folder.data, &flat);
     gsf_destroy_buffer(p->ctx, &folder);
     if (result) return gsf__dit_absent(p, result, k->makes, k->instead);
-    if (vggt) gsf__nn_query_vggt(&deep, &usual, &bytes, &flops);
-    else gsf__nn_query_dinov2(&flat, &usual, &bytes, &flops);
+    if (vggt) {
+        deep.bf16 = p->r->desc.bf16;
+        gsf__nn_query_vggt(&deep, &usual, &bytes, &flops);
+    } else {
+        flat.bf16 = p->r->desc.bf16;
+        gsf__nn_query_dinov2(&flat, &usual, &bytes, &flops);
+    }
     result = gsf__dit_misfit(p, k->folder, vggt ? 2 * (int64_t)deep.width : flat.width,
                              vggt ? t->vggt_channels : t->dino_channels);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
@@ -15202,6 +15216,7 @@ static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids
     if (!result) result = gsf_nn_load_t5(p->ctx, folder.data, &model);
     gsf_destroy_buffer(p->ctx, &folder);
     if (result) return result;
+    model.bf16 = p->r->desc.bf16;
     result = gsf__dit_misfit(p, "text_encoder", model.width, p->r->transformer.text_channels);
     gsf__nn_query_t5(&model, &in, &bytes, &flops);
     if (!ids) gsf__dit_add_cost(p->r, bytes, flops);
@@ -19578,7 +19593,7 @@ typedef struct gsf__nn_linear_grad_desc {
 // `workspace` NULL: scratch is allocated for this call only.
 GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_linear_grad_desc* d) {
     gsf__nn_linear_desc multiply;
-    int64_t in, out;
+    int64_t in = 0, out = 0;
     memset(&multiply, 0, sizeof multiply);
     multiply.x = d->x;
     multiply.rows = d->rows;

@@ -1102,6 +1102,34 @@ static void bench_blocks(const bench_options* o) {
 
 // ---- image encoders -------------------------------------------------------------------
 
+// Times `fn`, which writes `out` or adds to `first` there; with products of bfloat16, also the error that they make, relative
+// to what it writes or adds.
+static void bench_time_low(const bench_options* o, gsf_context* ctx, bench_row* row, void (*fn)(gsf_context*, void*), void* arg,
+                           int32_t* bf16, int32_t low, const float* first, const float* out, size_t count) {
+    float* exact = NULL;
+    if (low) {
+        exact = (float*)bench_alloc(ctx, count, sizeof(float));
+        *bf16 = 0;
+        fn(ctx, arg);
+        memcpy(exact, out, count * sizeof(float));
+        row->variant = BENCH_BF16;
+    }
+    *bf16 = low;
+    bench_time(o, ctx, row, fn, arg, 1.0);
+    if (low) {
+        double square = 0.0;
+        row->error_max = row->error_rel_l2 = 0.0;
+        for (size_t i = 0; i < count; i++) {
+            const double before = first ? (double)first[i] : 0.0;
+            bench_add_error(row, (double)out[i] - before, (double)exact[i] - before, &square);
+        }
+        row->error_rel_l2 = sqrt(row->error_rel_l2 / square);
+        row->reference = "float32";
+    }
+    bench_print(o->json, row);
+    gsf_free(ctx, exact);
+}
+
 // patches of 350 x 518
 enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_VIT_ACROSS = 37 };
 
@@ -1143,7 +1171,7 @@ static void bench_run_dinov2(gsf_context* ctx, void* arg) {
 }
 
 // Complete DINOv2-L with registers, from pixels to the last norm.
-static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers) {
+static void bench_one_dinov2(const bench_options* o, int threads, int32_t bf16, int64_t layers) {
     char name[96];
     snprintf(name, sizeof name, "dinov2 f32 %dx%d L=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)layers);
     gsf_context ctx;
@@ -1163,8 +1191,8 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     gsf__nn_query_dinov2(&b->net, &b->in, NULL, &flops);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
-    bench_time(o, &ctx, &row, bench_run_dinov2, b, 1.0);
-    bench_print(o->json, &row);
+    bench_time_low(o, &ctx, &row, bench_run_dinov2, b, &b->net.bf16, bf16, NULL, b->out,
+                   BENCH_VIT_ROWS * BENCH_VIT_ACROSS * BENCH_VIT_WIDTH);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, block);
     gsf_free(&ctx, weights);
@@ -1180,7 +1208,7 @@ static void bench_run_pair(gsf_context* ctx, void* arg) {
 }
 
 // One frame block and one global block of VGGT.
-static void bench_one_pair(const bench_options* o, int threads, int32_t images) {
+static void bench_one_pair(const bench_options* o, int threads, int32_t bf16, int32_t images) {
     char name[96];
     snprintf(name, sizeof name, "vggt pair f32 %dx%d N=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)images);
     gsf_context ctx;
@@ -1217,8 +1245,7 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
                          gsf__nn_block_flops(run->sizes, 1.0, (double)rows);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
-    bench_time(o, &ctx, &row, bench_run_pair, b, 1.0);
-    bench_print(o->json, &row);
+    bench_time_low(o, &ctx, &row, bench_run_pair, b, &run->bf16, bf16 ? GSF__NN_BF16_ALL : 0, b->first, b->x, values);
     gsf__nn_destroy_workspace(&ctx, &run->workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
@@ -1227,9 +1254,11 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
 
 static void bench_encoders(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_dinov2(o, threads, 2);
-        if (!o->quick && threads == 2) bench_one_dinov2(o, threads, 24); // half a minute
-        bench_one_pair(o, threads, 2);
+        for (int bf16 = 0; bf16 <= bench_has_bf16(o, GSF_NN_BF16); bf16++) {
+            bench_one_dinov2(o, threads, bf16, 2);
+            if (!o->quick && threads == 2) bench_one_dinov2(o, threads, bf16, 24); // half a minute
+            bench_one_pair(o, threads, bf16, 2);
+        }
     }
 }
 
@@ -1598,7 +1627,7 @@ static void bench_run_t5(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__nn_block_forward(&b->run, &b->block, 0, b->x, 1, b->in.tokens));
 }
 
-static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype, int32_t tokens) {
+static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype, int32_t bf16, int32_t tokens) {
     char name[96];
     snprintf(name, sizeof name, "t5 layer %s S=%d", dtype == GSF_NN_F32 ? "f32" : "bf16", (int)tokens);
     gsf_context ctx;
@@ -1631,8 +1660,7 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     gsf__nn_query_t5(&b.net, &b.in, &bytes, &flops);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
-    bench_time(o, &ctx, &row, bench_run_t5, &b, 1.0);
-    bench_print(o->json, &row);
+    bench_time_low(o, &ctx, &row, bench_run_t5, &b, &b.run.bf16, bf16 ? GSF__NN_BF16_ALL : 0, b.first, b.x, stream);
     gsf__nn_destroy_workspace(&ctx, &b.run.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
@@ -1640,8 +1668,9 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
 
 static void bench_t5s(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_t5(o, threads, GSF_NN_F32, o->quick ? 64 : 226);
-        bench_one_t5(o, threads, GSF_NN_BF16, o->quick ? 64 : 226);
+        bench_one_t5(o, threads, GSF_NN_F32, 0, o->quick ? 64 : 226);
+        for (int bf16 = 0; bf16 <= bench_has_bf16(o, GSF_NN_BF16); bf16++)
+            bench_one_t5(o, threads, GSF_NN_BF16, bf16, o->quick ? 64 : 226);
     }
 }
 

@@ -217,8 +217,8 @@ def block(match, quick, low=False):
     return lambda: layer(video, words, embedding, image_rotary_emb=table), 1
 
 
-def dinov2(match, quick):
-    """transformers' model at the size of DINOv2-L; all layers share their weights, as in bench_nn."""
+def dinov2(match, quick, low=False):
+    """transformers' model at the size of DINOv2-L; all layers share their weights, as in bench_nn. low: everything in bf16."""
     import transformers
     height, width, layers = (int(match.group(i)) for i in (1, 2, 3))
     config = transformers.Dinov2WithRegistersConfig(hidden_size=1024, num_hidden_layers=1, num_attention_heads=16,
@@ -226,23 +226,25 @@ def dinov2(match, quick):
     model = transformers.Dinov2WithRegistersModel(config).eval()
     model.encoder.layer = torch.nn.ModuleList([model.encoder.layer[0]] * layers)
     model.config.num_hidden_layers = layers
-    x = torch.rand(1, 3, height, width)
+    dtype = torch.bfloat16 if low else torch.float32
+    model, x = model.to(dtype), torch.rand(1, 3, height, width).to(dtype)
     return lambda: model(x).last_hidden_state[:, 5:], 1
 
 
-def pair(match, quick):
-    """A frame and a global block as VGGT's own code computes them: norms of q and k, two rotations, fused attention."""
-    f, d, heads = torch.nn.functional, 1024, 16
+def pair(match, quick, low=False):
+    """A frame and a global block as VGGT's own code computes them: norms of q and k, two rotations, fused attention. low:
+    everything in bf16."""
+    f, d, heads, dtype = torch.nn.functional, 1024, 16, torch.bfloat16 if low else torch.float32
     down, across, images = int(match.group(1)) // 14, int(match.group(2)) // 14, int(match.group(3))
-    linear = lambda out, fan: (torch.rand(out, fan).sub_(0.5).mul_(0.03), torch.rand(out).sub_(0.5))
-    qkv, out, up, low = linear(3 * d, d), linear(d, d), linear(4 * d, d), linear(d, 4 * d)
-    ones, small = torch.ones(d), torch.ones(64)
+    linear = lambda out, fan: (torch.rand(out, fan).sub_(0.5).mul_(0.03).to(dtype), torch.rand(out).sub_(0.5).to(dtype))
+    qkv, out, up, down_again = linear(3 * d, d), linear(d, d), linear(4 * d, d), linear(d, 4 * d)
+    ones, small = torch.ones(d, dtype=dtype), torch.ones(64, dtype=dtype)
     tokens = 5 + down * across
-    x = torch.rand(images, tokens, d).sub_(0.5)
+    x = torch.rand(images, tokens, d).sub_(0.5).to(dtype)
     places = torch.cartesian_prod(torch.arange(down), torch.arange(across)) + 1
     places = torch.cat([torch.zeros(5, 2, dtype=places.dtype), places])
     angles = torch.arange(max(down, across) + 1).float()[:, None] * 100.0 ** (-torch.arange(0, 32, 2).float() / 32)
-    cos, sin = torch.cat([angles, angles], -1).cos(), torch.cat([angles, angles], -1).sin()
+    cos, sin = torch.cat([angles, angles], -1).cos().to(dtype), torch.cat([angles, angles], -1).sin().to(dtype)
 
     def turned(y, where):  # halves of each head by row and column; pairs are half of that apart
         parts = []
@@ -258,7 +260,7 @@ def pair(match, quick):
         q, k = f.layer_norm(q, (64,), small, small, 1e-5), f.layer_norm(k, (64,), small, small, 1e-5)
         a = f.scaled_dot_product_attention(turned(q, where), turned(k, where), v)
         y = y + f.linear(a.transpose(1, 2).reshape(samples, n, d), *out) * ones
-        return y + f.linear(f.gelu(f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *up)), *low) * ones
+        return y + f.linear(f.gelu(f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *up)), *down_again) * ones
 
     def run():
         y = block(x, places)
@@ -266,7 +268,7 @@ def pair(match, quick):
     return run, 1
 
 
-def t5_layer(match, quick):
+def t5_layer(match, quick, low=False):
     """The layers of transformers' T5Block (v1.1) at the size of T5-XXL, one prompt; bf16: activations are bf16 as well."""
     f, d, heads, hidden = torch.nn.functional, 4096, 64, 10240
     dtype = torch.float32 if match.group(1) == "f32" else torch.bfloat16
@@ -342,7 +344,7 @@ def compute_in_bf16(ours, match):
 def comparable(ours, match, make):
     low, bf16, few = ours["variant"] == LOW, match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
     # PyTorch multiplies bf16 weights by bf16 activations only: with bf16 instructions, our float32 products have no peer
-    if low != bf16 and (make is block or (make is linear and not few and ours["isa"] in ("avx512_bf16", "amx"))):
+    if low != bf16 and (make is block or (make in (linear, t5_layer) and not few and ours["isa"] in ("avx512_bf16", "amx"))):
         return False
     return not (make is linear and match.group(1) == "f16" and not few)  # takes PyTorch minutes
 

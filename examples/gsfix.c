@@ -108,7 +108,7 @@ static const option_spec option_specs[] = {
     {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore evaluate",
      "dit: quantize most layers of the transformer to 8-bit integers; needs one byte of memory per weight"},
     {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore evaluate",
-     "dit: matrix products of the transformer in bfloat16 where the processor has instructions that make them faster\n"
+     "dit: matrix products of the transformer and the encoders in bfloat16 where the processor has fast instructions for them\n"
      "(AMX, or AVX512_BF16, but not Intel's); implied by --quality fast"},
     {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore evaluate",
      "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"

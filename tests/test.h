@@ -87,6 +87,17 @@ static inline double test_random_in(uint64_t* state, double lo, double hi) {
     return lo + (hi - lo) * test_random(state);
 }
 
+// L2 norm of the difference over that of `expected`.
+static inline double test_relative_error(const float* actual, const float* expected, size_t count) {
+    double difference = 0.0, norm = 0.0;
+    for (size_t i = 0; i < count; i++) {
+        const double d = (double)actual[i] - (double)expected[i];
+        difference += d * d;
+        norm += (double)expected[i] * (double)expected[i];
+    }
+    return sqrt(difference / norm);
+}
+
 // ---- golden data ---------------------------------------------------------------
 
 // Path of a file below GSF_GOLDEN (environment, default: the committed copy, compiled in as TEST_GOLDEN). Static

@@ -83,6 +83,24 @@ for condition in none 2d 3d; do
     restore "$scratch/$condition" --condition "$condition" || fail "--condition $condition failed"
     ! cmp -s "$scratch/$condition/$(basename "$frame")" "$frame" || fail "--condition $condition changes nothing"
 done
+# --bf16 rounds the products of all three encoders where the processor has fast instructions for that, and nothing elsewhere.
+isa=$(sed -n 's/.*"isa": *"\([a-z0-9_]*\)".*/\1/p' "$scratch/whole/metrics.json" | head -n 1)
+[ -n "$isa" ] || fail "metrics.json does not tell the instruction set"
+dit=()
+for condition in none 2d 3d; do # the prompts alone, then with either encoder of photos
+    given=(--caption "a wall" --restorer "dit:$scratch/all")
+    [ "$condition" = none ] || given+=(--ref-features "$scratch/none.safetensors")
+    frames=("$scratch"/clip/*)
+    given+=(--condition "$condition" --refs "${frames[0]},${frames[-1]}" --steps 1)
+    restore "$scratch/exact_$condition" "${given[@]}" --save-features "$scratch/$condition.safetensors" ||
+        fail "features of --condition $condition are not saved"
+    restore "$scratch/low_$condition" "${given[@]}" --save-features "$scratch/low_$condition.safetensors" --bf16 || fail "--bf16 failed"
+    same=0
+    ! cmp -s "$scratch/$condition.safetensors" "$scratch/low_$condition.safetensors" || same=1
+    case $isa in avx512_bf16|amx) wanted=0;; *) wanted=1;; esac
+    [ "$same" = "$wanted" ] || fail "features of --condition $condition by --bf16 on $isa: same $same"
+done
+dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/all/features.safetensors")
 restore "$scratch/fast" --steps 8 --solver unipc --guidance-until 0.5 --strength 0.5 --block-cache 0.1 --int8 --bf16 ||
     fail "the options that save steps failed"
 

@@ -229,6 +229,33 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
     free(more);
 }
 
+// Products of bfloat16 stay near those of float32, and do not depend on the workers either; other processors ignore it.
+static void test_bf16(gsf_context* ctx, gsf_nn_dinov2* dino, gsf_nn_vggt* vggt, const float* expected, float* out) {
+    const gsf_nn_encoder_desc in = small_input();
+    const size_t tokens = (size_t)(IMAGES * (IMAGE_HEIGHT / dino->patch) * (IMAGE_WIDTH / dino->patch));
+    const size_t counts[2] = {tokens * (size_t)dino->width, tokens * 2 * (size_t)vggt->width};
+    gsf_context three;
+    test_context_zero(&three);
+    work_backwards(&three);
+    CHECK_OK(&three, gsf_init_context(&three));
+    float *plain = (float*)malloc(counts[0] * sizeof(float)), *again = (float*)malloc(counts[1] * sizeof(float));
+    CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, dino, &in, plain));
+    dino->bf16 = vggt->bf16 = 1;
+    for (int kind = 0; kind < 2; kind++) {
+        const float* from = kind ? expected : plain;
+        CHECK_OK(ctx, kind ? gsf_nn_encode_vggt(ctx, vggt, &in, out) : gsf_nn_encode_dinov2(ctx, dino, &in, out));
+        CHECK_OK(&three, kind ? gsf_nn_encode_vggt(&three, vggt, &in, again) : gsf_nn_encode_dinov2(&three, dino, &in, again));
+        CHECK(memcmp(out, again, counts[kind] * sizeof(float)) == 0);
+        const double error = test_relative_error(out, from, counts[kind]);
+        if (ctx->cpu_level == GSF_CPU_AVX512_BF16 || ctx->cpu_level == GSF_CPU_AMX) CHECK(error > 1e-5 && error < 2e-2);
+        else CHECK(error == 0.0);
+        if (getenv("GSF_TEST_VERBOSE")) printf("bf16 %s: relative L2 error %.3g\n", kind ? "vggt" : "dinov2", error);
+    }
+    dino->bf16 = vggt->bf16 = 0;
+    free(plain);
+    free(again);
+}
+
 // More images than one group holds: each is encoded as it is alone.
 static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out) {
     enum { MANY = 420 };
@@ -372,6 +399,7 @@ int main(void) {
         !CHECK_OK(&ctx, gsf_nn_load_vggt(&ctx, test_golden("encoders/vggt"), &vggt)))
         return test_report();
     test_workers(&dino, &vggt, expected, out);
+    test_bf16(&ctx, &dino, &vggt, expected, out);
     test_vggt_alone(&ctx, expected, out);
     test_groups(&ctx, &dino, out);
     test_cancel(&ctx, &vggt, out);

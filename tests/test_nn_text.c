@@ -390,6 +390,17 @@ static void test_t5_runs(void) {
     CHECK_OK(&three, gsf_init_context(&three));
     CHECK_OK(&three, gsf_nn_encode_t5(&three, &net, &in, other));
     CHECK(memcmp(one, other, values * sizeof(float)) == 0);
+    float* low = (float*)malloc(values * sizeof(float));
+    net.bf16 = 1; // products of bfloat16 where the processor has them
+    CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, other));
+    CHECK_OK(&three, gsf_nn_encode_t5(&three, &net, &in, low));
+    CHECK(memcmp(low, other, values * sizeof(float)) == 0);
+    const double error = test_relative_error(low, one, values);
+    if (ctx.cpu_level == GSF_CPU_AVX512_BF16 || ctx.cpu_level == GSF_CPU_AMX) CHECK(error > 1e-5 && error < 2e-2);
+    else CHECK(error == 0.0);
+    if (getenv("GSF_TEST_VERBOSE")) printf("bf16 t5: relative L2 error %.3g\n", error);
+    net.bf16 = 0;
+    free(low);
     for (int b = 0; b < TEXTS; b++) { // a batch gives the same as its prompts one by one
         gsf_nn_t5_desc single = in;
         single.batch = 1;
