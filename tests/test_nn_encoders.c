@@ -230,7 +230,7 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
 }
 
 // Products of bfloat16 stay near those of float32, and do not depend on the workers either; other processors ignore it.
-static void test_bf16(gsf_context* ctx, gsf_nn_dinov2* dino, gsf_nn_vggt* vggt, const float* expected, float* out) {
+static void test_encoders_bf16(gsf_context* ctx, gsf_nn_dinov2* dino, gsf_nn_vggt* vggt, const float* expected, float* out) {
     const gsf_nn_encoder_desc in = small_input();
     const size_t tokens = (size_t)(IMAGES * (IMAGE_HEIGHT / dino->patch) * (IMAGE_WIDTH / dino->patch));
     const size_t counts[2] = {tokens * (size_t)dino->width, tokens * 2 * (size_t)vggt->width};
@@ -399,7 +399,7 @@ int main(void) {
         !CHECK_OK(&ctx, gsf_nn_load_vggt(&ctx, test_golden("encoders/vggt"), &vggt)))
         return test_report();
     test_workers(&dino, &vggt, expected, out);
-    test_bf16(&ctx, &dino, &vggt, expected, out);
+    test_encoders_bf16(&ctx, &dino, &vggt, expected, out);
     test_vggt_alone(&ctx, expected, out);
     test_groups(&ctx, &dino, out);
     test_cancel(&ctx, &vggt, out);
