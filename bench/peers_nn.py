@@ -344,7 +344,7 @@ def compute_in_bf16(ours, match):
 def comparable(ours, match, make):
     low, bf16, few = ours["variant"] == LOW, match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
     # PyTorch multiplies bf16 weights by bf16 activations only: with bf16 instructions, our float32 products have no peer
-    if low != bf16 and (make is block or (make in (linear, t5_layer) and not few and ours["isa"] in ("avx512_bf16", "amx"))):
+    if low != bf16 and (make is block or (make is linear and not few and ours["isa"] in ("avx512_bf16", "amx"))):
         return False
     return not (make is linear and match.group(1) == "f16" and not few)  # takes PyTorch minutes
 

@@ -532,15 +532,6 @@ static gsf_nn_sample_stats run_sample(gsf_context* ctx, sample_case* s, float* v
     return stats;
 }
 
-static double difference(const float* a, const float* b, size_t count) { // relative L2
-    double error = 0.0, norm = 0.0;
-    for (size_t i = 0; i < count; i++) {
-        error += ((double)a[i] - (double)b[i]) * ((double)a[i] - (double)b[i]);
-        norm += (double)b[i] * (double)b[i];
-    }
-    return sqrt(error / norm);
-}
-
 static void test_skips(gsf_context* ctx, sample_case* s) {
     float* reference = (float*)malloc(s->values * sizeof(float));
     s->desc.steps = 8;
@@ -550,7 +541,7 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
     s->desc.guidance_begin = 0.25f; // half of the steps guided
     s->desc.guidance_end = 0.75f;
     stats = run_sample(ctx, s, s->video);
-    CHECK(stats.network_rows == 12 && difference(s->video, reference, s->values) > 1e-4);
+    CHECK(stats.network_rows == 12 && test_relative_error(s->video, reference, s->values) > 1e-4);
     s->desc.guidance_begin = s->desc.guidance_end = 0.0f;
 
     s->desc.block_cache = 1e-9f; // so small that no two steps are similar enough: the same bits as without the cache
@@ -559,7 +550,7 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
     s->desc.block_cache = 0.8f; // with random weights, successive steps differ a lot
     stats = run_sample(ctx, s, s->video);
     CHECK(stats.cached_steps > 0 && stats.cached_steps < 8);
-    CHECK(difference(s->video, reference, s->values) < 1.0);
+    CHECK(test_relative_error(s->video, reference, s->values) < 1.0);
     s->desc.block_cache = 0.0f;
 
     s->desc.strength = 0.5f; // the last half of the schedule, from the noised control frames
@@ -572,7 +563,7 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
         s->desc.solver = (gsf_nn_solver)solver;
         s->desc.steps = 40;
         run_sample(ctx, s, solver ? s->video : reference);
-        if (solver) CHECK(difference(s->video, reference, s->values) < 0.2);
+        if (solver) CHECK(test_relative_error(s->video, reference, s->values) < 0.2);
     }
     s->desc.solver = GSF_NN_SOLVER_DDIM;
     s->desc.steps = 0;
@@ -728,7 +719,7 @@ static void test_any_frames(gsf_context* ctx, sample_case* s) {
     s->net.sample_frames = 17;
     run_sample(ctx, s, sines);
     s->net.sample_frames = 9;
-    const double apart = difference(sines, s->video, s->values);
+    const double apart = test_relative_error(sines, s->video, s->values);
     printf("sines in place of the learned positions: relative L2 %.3g of the frames\n", apart);
     CHECK(apart > 1e-3);
     free(sines);

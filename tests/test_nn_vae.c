@@ -13,15 +13,6 @@ static float* random_floats(uint64_t* seed, size_t count, double scale) {
     return x;
 }
 
-static double rel_l2(const float* a, const float* b, size_t count) {
-    double difference = 0.0, square = 0.0;
-    for (size_t i = 0; i < count; i++) {
-        difference += ((double)a[i] - b[i]) * ((double)a[i] - b[i]);
-        square += (double)b[i] * b[i];
-    }
-    return sqrt(difference / square);
-}
-
 // ---- convolution
 
 typedef struct conv_case {
@@ -391,9 +382,9 @@ static void compare_results(const vae_result* a, const vae_result* b, double tol
         CHECK(memcmp(a->logvar, b->logvar, a->latents * sizeof(float)) == 0);
         CHECK(memcmp(a->video, b->video, a->pixels * sizeof(float)) == 0);
     } else {
-        CHECK(rel_l2(a->mean, b->mean, a->latents) < tolerance);
-        CHECK(rel_l2(a->logvar, b->logvar, a->latents) < tolerance);
-        CHECK(rel_l2(a->video, b->video, a->pixels) < tolerance);
+        CHECK(test_relative_error(a->mean, b->mean, a->latents) < tolerance);
+        CHECK(test_relative_error(a->logvar, b->logvar, a->latents) < tolerance);
+        CHECK(test_relative_error(a->video, b->video, a->pixels) < tolerance);
     }
 }
 
@@ -523,7 +514,7 @@ static void test_tiles(gsf_context* ctx, const gsf_nn_vae* vae) {
     vae_result a = both_ways(&scalar, &desc, 5, 44, 56), b = both_ways(ctx, &desc, 5, 44, 56);
     vae_result whole = both_ways(ctx, NULL, 5, 44, 56);
     compare_results(&b, &a, 5e-6);
-    CHECK(rel_l2(b.mean, whole.mean, b.latents) > 1e-3);
+    CHECK(test_relative_error(b.mean, whole.mean, b.latents) > 1e-3);
     // An image no larger than a tile is not tiled.
     vae_result small = both_ways(ctx, &desc, 5, 24, 20), untiled = both_ways(ctx, NULL, 5, 24, 20);
     compare_results(&small, &untiled, 0.0);
