@@ -19635,8 +19635,13 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, gsf__nn_workspace* 
 /* FlashAttention-2's backward pass (Dao 2023): per head and block of keys, blocks of queries recompute the weights from the
    logits and the forward pass's lse. With p = softmax(s), s the logits:
        dp = dy v^T    ds = p (dp - sum(p dp)) = p (dp - dy out^T)    dv += p^T dy    dq += scale ds k    dk += scale ds^T q
-   All five products are of blocks that stay in cache, with bf16 and AMX as tiles. A unit of work is one head. */
-enum { GSF__ATT_GRAD_KEYS = 128, GSF__ATT_GRAD_QUERIES = 96 }; // per block; queries: a multiple of 6
+   All five products are of blocks that stay in cache, with bf16 of operands that are packed as those of linear layers. A unit
+   of work is one head. */
+enum {
+    GSF__ATT_GRAD_KEYS = 128,    // per block
+    GSF__ATT_GRAD_QUERIES = 96,  // per block; a multiple of 6, 16 and 32
+    GSF__ATT_GRAD_GROUP = 16     // rows of a packed group, at most
+};
 
 typedef struct gsf__nn_attention_grad_desc {
     const gsf__nn_attention_desc* forward; // of the forward pass, with out and lse; without mask and bias
@@ -19654,7 +19659,10 @@ struct gsf__attention_grad_job {
     float* scratch;
     size_t scratch_floats;       // per worker
     int64_t pitch;               // of rows of head_dim values in scratch
-    int tiles;                   // products of bf16 by AMX
+    const gsf__linear_kernels* pairs; // of bf16, or NULL
+    // With pairs: c = a b or, with `add`, c += a b, of groups of rows and panels of columns; sums: room for two of each
+    void (*multiply_packed)(const gsf__linear_kernels* pairs, const float* a, int64_t rows, const float* b, int64_t count,
+                            int64_t columns, float* c, int64_t ldc, int add, float* sums);
     // Fills b->k_across, v_across and k_pairs from b->k, of which there are `keys`, and v
     void (*prepare_keys)(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t column, int64_t key,
                          int64_t keys);
@@ -19669,23 +19677,24 @@ static int64_t gsf__grad_pitch(int64_t columns) { return (gsf__ceil_div(columns,
 enum { GSF__ATT_GRAD_PITCH = GSF__ATT_GRAD_KEYS + 16 };
 
 struct gsf__attention_grad_blocks { // of one worker
-    float *q, *dy;           // (queries, dim), rows `pitch` apart
+    float *q, *dy;           // (queries, dim), rows `pitch` apart; with pairs packed twice: all queries, block by block
     float *k, *dk, *dv;      // (keys, dim)
-    float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart; with tiles packed, as k_pairs (keys, dim)
+    float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart; with pairs packed, as k_pairs (keys, dim)
     float *p, *dp;           // (queries, keys)
     float *center, *delta;   // (dim); (queries): dy out^T
-    float *k_pairs, *packed, *packed_w; // with tiles; the latter two: operands of one product
+    float *k_pairs, *packed, *sums; // with pairs; packed: an operand of one product
 };
 
 // Divides the memory of a worker; returns the floats needed.
 static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, float* memory,
                                           gsf__attention_grad_blocks* b) {
-    const size_t pitch = (size_t)job->pitch, dim = (size_t)gsf__round_up(job->desc.head_dim, 32), tiles = job->tiles ? 1 : 0;
-    const size_t across = tiles ? GSF__ATT_GRAD_KEYS * dim / 2 : (size_t)job->desc.head_dim * GSF__ATT_GRAD_PITCH;
+    const size_t pitch = (size_t)job->pitch, dim = (size_t)gsf__round_up(job->desc.head_dim, 32), pairs = job->pairs ? 1 : 0;
+    const size_t across = pairs ? GSF__ATT_GRAD_KEYS * dim / 2 : (size_t)job->desc.head_dim * GSF__ATT_GRAD_PITCH;
     const size_t longest = dim > GSF__ATT_GRAD_KEYS ? dim : (size_t)GSF__ATT_GRAD_KEYS;
     gsf__nn_arena arena = {memory, 0};
-    b->q = gsf__nn_share(&arena, tiles ? 0 : GSF__ATT_GRAD_QUERIES * pitch);
-    b->dy = gsf__nn_share(&arena, tiles ? 0 : GSF__ATT_GRAD_QUERIES * pitch);
+    const size_t blocks = (size_t)gsf__ceil_div(job->desc.queries, GSF__ATT_GRAD_QUERIES);
+    b->q = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * (pairs ? blocks * dim : pitch));
+    b->dy = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * (pairs ? blocks * dim : pitch));
     b->k = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->dk = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
     b->dv = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
@@ -19694,10 +19703,10 @@ static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, fl
     b->p = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->dp = gsf__nn_share(&arena, (size_t)GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
     b->center = gsf__nn_share(&arena, pitch);
-    b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
-    b->k_pairs = gsf__nn_share(&arena, tiles * dim * GSF__ATT_GRAD_KEYS / 2);
-    b->packed = gsf__nn_share(&arena, tiles * GSF__ATT_GRAD_KEYS * longest / 2);
-    b->packed_w = gsf__nn_share(&arena, tiles * dim * GSF__ATT_GRAD_QUERIES / 2);
+    b->delta = gsf__nn_share(&arena, (size_t)gsf__round_up(job->desc.queries, 16)); // what follows is aligned for vectors
+    b->k_pairs = gsf__nn_share(&arena, pairs * dim * GSF__ATT_GRAD_KEYS / 2);
+    b->packed = gsf__nn_share(&arena, pairs * (GSF__ATT_GRAD_KEYS + GSF__ATT_GRAD_GROUP) * longest / 2);
+    b->sums = gsf__nn_share(&arena, pairs * 4 * GSF__ATT_GRAD_GROUP * GSF__TILE_COLUMNS);
     return arena.used;
 }
 
@@ -19746,93 +19755,140 @@ static void gsf__attention_grad_keys(const gsf__attention_grad_job* job, const g
     }
 }
 
+// Operands as groups and panels of pairs, as in >>nn linear. From rows, or from columns with their rows ld apart:
+static void gsf__groups_along(const gsf__linear_kernels* pairs, const float* x, int64_t ld, int64_t rows, int64_t count,
+                              float* out) {
+    for (int64_t r = 0; r < rows; r += pairs->height, out += pairs->height * gsf__round_up(count, 32) / 2)
+        pairs->pack_rows(x + r * ld, ld, gsf__least(rows - r, pairs->height), count, out);
+}
+
+static void gsf__groups_across(const gsf__linear_kernels* pairs, const float* x, int64_t ld, int64_t rows, int64_t count,
+                               float* out) {
+    for (int64_t r = 0; r < rows; r += pairs->height, out += pairs->height * gsf__round_up(count, 32) / 2)
+        pairs->pack_columns(x + r, ld, gsf__least(rows - r, pairs->height), count, out);
+}
+
+static void gsf__panels_along(const gsf__linear_kernels* pairs, const float* x, int64_t ld, int64_t columns, int64_t count,
+                              float* out) {
+    const size_t pitch = (size_t)ld * sizeof *x;
+    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
+        pairs->pack_weights((const char*)(x + c * ld), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
+}
+
+static void gsf__panels_across(const gsf__linear_kernels* pairs, const float* x, int64_t ld, int64_t columns, int64_t count,
+                               float* out) {
+    const size_t pitch = (size_t)ld * sizeof *x;
+    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
+        pairs->pack_transposed((const char*)(x + c), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
+}
+
+#if GSF__X86
+
+GSF__TARGET_AVX512 static void gsf__multiply_pairs(const gsf__linear_kernels* pairs, const float* a, int64_t rows,
+                                                   const float* b, int64_t count, int64_t columns, float* c, int64_t ldc,
+                                                   int add, float* sums) {
+    const int64_t steps = gsf__round_up(count, 32) / 2, height = pairs->height, tile = height * 16;
+    for (int64_t row = 0; row < rows; row += 2 * height, a += 2 * height * steps)
+        for (int64_t column = 0; column < columns; column += 32) {
+            const float* w = b + column * steps;
+            const int two_groups = rows - row > height, two_panels = columns - column > 16;
+            if (two_groups && two_panels) pairs->four_tiles(a, w, steps, 0, sums, 2 * tile, w, 0);
+            else
+                for (int i = 0; i <= two_groups + two_panels; i++)
+                    pairs->tile(a + (two_groups ? i * height * steps : 0), w + (two_panels ? i * 16 * steps : 0), steps, 0,
+                                sums + i * (two_panels ? 2 : 1) * tile, w, 0);
+            for (int p = 0; p <= two_panels; p++) {
+                const __mmask16 mask = gsf__nn_mask16(columns - column - 16 * p);
+                const float* from = sums + 2 * p * tile;
+                float* to = c + row * ldc + column + 16 * p;
+                for (int64_t r = gsf__least(rows - row, 2 * height); r > 0; r--, from += 16, to += ldc) {
+                    const __m512 v = _mm512_loadu_ps(from);
+                    _mm512_mask_storeu_ps(to, mask, add ? _mm512_add_ps(v, _mm512_maskz_loadu_ps(mask, to)) : v);
+                }
+            }
+        }
+}
+
+#endif
+
 #if GSF__AMX
 
-// Operands as groups and panels of tiles of bf16, as in >>nn linear. From rows, or from columns with their rows ld apart:
-GSF__TARGET_BF16 static void gsf__groups_along(const float* x, int64_t ld, int64_t rows, int64_t count, float* out) {
-    for (int64_t r = 0; r < rows; r += GSF__AMX_ROWS, out += GSF__AMX_ROWS * gsf__round_up(count, 32) / 2)
-        gsf__pack_rows_amx(x + r * ld, ld, gsf__least(rows - r, GSF__AMX_ROWS), count, out);
-}
-
-GSF__TARGET_BF16 static void gsf__groups_across(const float* x, int64_t ld, int64_t rows, int64_t count, float* out) {
-    for (int64_t r = 0; r < rows; r += GSF__AMX_ROWS, out += GSF__AMX_ROWS * gsf__round_up(count, 32) / 2)
-        gsf__pack_columns_amx(x + r, ld, gsf__least(rows - r, GSF__AMX_ROWS), count, out);
-}
-
-GSF__TARGET_BF16 static void gsf__panels_along(const float* x, int64_t ld, int64_t columns, int64_t count, float* out) {
-    const size_t pitch = (size_t)ld * sizeof *x;
-    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
-        gsf__pack_weights_bf16((const char*)(x + c * ld), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
-}
-
-GSF__TARGET_BF16 static void gsf__panels_across(const float* x, int64_t ld, int64_t columns, int64_t count, float* out) {
-    const size_t pitch = (size_t)ld * sizeof *x;
-    for (int64_t c = 0; c < columns; c += 16, out += 16 * gsf__round_up(count, 32) / 2)
-        gsf__pack_transposed_bf16((const char*)(x + c), GSF_NN_F32, pitch, gsf__least(columns - c, 16), count, out);
-}
-
-// c = a b or, with `add`, c += a b, of packed operands; tiles at the edges of c go through `edge`.
-GSF__TARGET_AMX static void gsf__multiply_amx(const float* a, int64_t rows, const float* b, int64_t count, int64_t columns,
-                                              float* c, int64_t ldc, int add) {
+// Tiles that are whole stay in their registers until they are stored in c; those at its edges go through `sums`.
+GSF__TARGET_AMX static void gsf__multiply_amx(const gsf__linear_kernels* pairs, const float* a, int64_t rows, const float* b,
+                                              int64_t count, int64_t columns, float* c, int64_t ldc, int add, float* sums) {
     const int64_t tiles = gsf__ceil_div(count, 32), size = tiles * GSF__AMX_TILE;
+    (void)pairs;
     for (int64_t row = 0; row < rows; row += GSF__AMX_ROWS, a += size)
         for (int64_t column = 0; column < columns; column += 16) {
             const int64_t height = gsf__least(rows - row, GSF__AMX_ROWS), width = gsf__least(columns - column, 16);
             const float* w = b + column / 16 * size;
             const int whole = height == GSF__AMX_ROWS && width == 16;
-            float edge[GSF__AMX_TILE], *to = c + row * ldc + column, *sums = whole ? to : edge;
+            float *to = c + row * ldc + column, *tile = whole ? to : sums;
             const int64_t pitch = whole ? 4 * ldc : 64;
             for (int64_t r = 0; add && !whole && r < height; r++)
-                memcpy(edge + 16 * r, to + r * ldc, (size_t)width * sizeof *c);
+                memcpy(sums + 16 * r, to + r * ldc, (size_t)width * sizeof *c);
             GSF__AMX_FENCE
-            if (add) _tile_loadd(0, sums, pitch);
+            if (add) _tile_loadd(0, tile, pitch);
             else _tile_zero(0);
             for (int64_t k = 0; k < tiles; k++) {
                 _tile_loadd(4, a + k * GSF__AMX_TILE, 64);
                 _tile_loadd(6, w + k * GSF__AMX_TILE, 64);
                 _tile_dpbf16ps(0, 4, 6);
             }
-            _tile_stored(0, sums, pitch);
+            _tile_stored(0, tile, pitch);
             GSF__AMX_FENCE
-            for (int64_t r = 0; !whole && r < height; r++) memcpy(to + r * ldc, edge + 16 * r, (size_t)width * sizeof *c);
+            for (int64_t r = 0; !whole && r < height; r++) memcpy(to + r * ldc, sums + 16 * r, (size_t)width * sizeof *c);
         }
 }
 
-// As gsf__attention_grad_block, by tiles
-static void gsf__attention_grad_block_amx(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t head,
-                                          int64_t first, int64_t keys) {
+#endif
+
+// Packs q and dy, each as groups along and, after these, as panels across.
+static void gsf__attention_grad_queries_pairs(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b,
+                                              int64_t column) {
     const gsf__nn_attention_desc* d = &job->desc;
-    const int64_t dim = d->head_dim, width = d->heads * dim, column = head * dim, across = GSF__ATT_GRAD_PITCH;
-    const int64_t queries = gsf__least(GSF__ATT_GRAD_QUERIES, d->queries - first), pitch = job->pitch;
-    const float *q = d->q + first * d->ldq + column, *dy = job->grad->dy + first * width + column;
+    const int64_t dim = d->head_dim, width = d->heads * dim, half = GSF__ATT_GRAD_QUERIES * gsf__round_up(dim, 32) / 2;
+    for (int64_t first = 0, at = 0; first < d->queries; first += GSF__ATT_GRAD_QUERIES, at += 2 * half) {
+        const int64_t queries = gsf__least(GSF__ATT_GRAD_QUERIES, d->queries - first);
+        const float *q = d->q + first * d->ldq + column, *dy = job->grad->dy + first * width + column;
+        gsf__groups_along(job->pairs, q, d->ldq, queries, dim, b->q + at);
+        gsf__panels_across(job->pairs, q, d->ldq, dim, queries, b->q + at + half);
+        gsf__groups_along(job->pairs, dy, width, queries, dim, b->dy + at);
+        gsf__panels_across(job->pairs, dy, width, dim, queries, b->dy + at + half);
+    }
+}
+
+// As gsf__attention_grad_block, of packed operands
+static void gsf__attention_grad_block_pairs(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b,
+                                            int64_t head, int64_t first, int64_t keys) {
+    const gsf__nn_attention_desc* d = &job->desc;
+    const gsf__linear_kernels* pairs = job->pairs;
+    const int64_t dim = d->head_dim, width = d->heads * dim, across = GSF__ATT_GRAD_PITCH, pitch = job->pitch;
+    const int64_t queries = gsf__least(GSF__ATT_GRAD_QUERIES, d->queries - first), block = gsf__round_up(dim, 32);
+    const float *q = b->q + first * block, *dy = b->dy + first * block;
+    const float *q_across = q + GSF__ATT_GRAD_QUERIES * block / 2, *dy_across = dy + GSF__ATT_GRAD_QUERIES * block / 2;
     const float *lse = d->lse + head * d->queries + first, *delta = b->delta + first;
-    float *x = b->packed, *w = b->packed_w;
-    gsf__groups_along(q, d->ldq, queries, dim, x);
-    gsf__multiply_amx(x, queries, b->k_across, dim, keys, b->p, across, 0);
-    gsf__groups_along(dy, width, queries, dim, x);
-    gsf__multiply_amx(x, queries, b->v_across, dim, keys, b->dp, across, 0);
+    job->multiply_packed(pairs, q, queries, b->k_across, dim, keys, b->p, across, 0, b->sums);
+    job->multiply_packed(pairs, dy, queries, b->v_across, dim, keys, b->dp, across, 0, b->sums);
     for (int64_t r = 0; r < queries; r++)
         job->kernels->attention(b->p + r * across, b->dp + r * across, keys, d->scale * 1.44269504f, d->scale, lse[r],
                                 delta[r]);
-    gsf__groups_across(b->p, across, keys, queries, x);
-    gsf__panels_across(dy, width, dim, queries, w);
-    gsf__multiply_amx(x, keys, w, queries, dim, b->dv, pitch, 1);
-    gsf__groups_across(b->dp, across, keys, queries, x);
-    gsf__panels_across(q, d->ldq, dim, queries, w);
-    gsf__multiply_amx(x, keys, w, queries, dim, b->dk, pitch, 1);
-    gsf__groups_along(b->dp, across, queries, keys, x);
-    gsf__multiply_amx(x, queries, b->k_pairs, keys, dim, job->grad->dq + first * width + column, width, 1);
+    gsf__groups_across(pairs, b->p, across, keys, queries, b->packed);
+    job->multiply_packed(pairs, b->packed, keys, dy_across, queries, dim, b->dv, pitch, 1, b->sums);
+    gsf__groups_across(pairs, b->dp, across, keys, queries, b->packed);
+    job->multiply_packed(pairs, b->packed, keys, q_across, queries, dim, b->dk, pitch, 1, b->sums);
+    gsf__groups_along(pairs, b->dp, across, queries, keys, b->packed);
+    job->multiply_packed(pairs, b->packed, queries, b->k_pairs, keys, dim, job->grad->dq + first * width + head * dim, width, 1,
+                         b->sums);
 }
 
-static void gsf__attention_grad_keys_amx(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b,
-                                         int64_t column, int64_t key, int64_t keys) {
+static void gsf__attention_grad_keys_pairs(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b,
+                                           int64_t column, int64_t key, int64_t keys) {
     const gsf__nn_attention_desc* d = &job->desc;
-    gsf__panels_along(b->k, job->pitch, keys, d->head_dim, b->k_across);
-    gsf__panels_along(d->v + key * d->ldv + column, d->ldv, keys, d->head_dim, b->v_across);
-    gsf__panels_across(b->k, job->pitch, d->head_dim, keys, b->k_pairs);
+    gsf__panels_along(job->pairs, b->k, job->pitch, keys, d->head_dim, b->k_across);
+    gsf__panels_along(job->pairs, d->v + key * d->ldv + column, d->ldv, keys, d->head_dim, b->v_across);
+    gsf__panels_across(job->pairs, b->k, job->pitch, d->head_dim, keys, b->k_pairs);
 }
-
-#endif
 
 static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
     const gsf__attention_grad_job* job = (const gsf__attention_grad_job*)arg;
@@ -19840,9 +19896,8 @@ static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
     const int64_t dim = d->head_dim, width = d->heads * dim, head = (int64_t)index, column = head * dim;
     gsf__attention_grad_blocks b;
     gsf__attention_grad_lay_out(job, job->scratch + (size_t)worker * job->scratch_floats, &b);
-#if GSF__AMX
-    if (job->tiles) gsf__enter_tiles();
-#endif
+    if (job->pairs && job->pairs->enter) job->pairs->enter();
+    if (job->pairs) gsf__attention_grad_queries_pairs(job, &b, column);
     gsf__attention_center(d, column, b.center);
     for (int64_t r = 0; r < d->queries; r++) {
         const float *dy = job->grad->dy + r * width + column, *out = d->out + r * d->ldo + column;
@@ -19864,9 +19919,7 @@ static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
         gsf__attention_grad_copy(b.dk, job->pitch, keys, dim, width, job->grad->dk + key * width + column);
         gsf__attention_grad_copy(b.dv, job->pitch, keys, dim, width, job->grad->dv + key * width + column);
     }
-#if GSF__AMX
-    if (job->tiles) gsf__leave_tiles();
-#endif
+    if (job->pairs && job->pairs->leave) job->pairs->leave();
 }
 
 GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_attention_grad_desc* desc) {
@@ -19883,14 +19936,15 @@ GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_at
     gsf__attention_fill_in(d);
     job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
     job.pitch = gsf__grad_pitch(d->head_dim);
-    job.prepare_keys = gsf__attention_grad_keys;
-    job.run_block = gsf__attention_grad_block;
+    const gsf__linear_kernels* products = gsf__linear_kernels_of(ctx->cpu_level, d->bf16 != 0);
+    job.pairs = products->unit == 2 ? products : NULL;
+    job.prepare_keys = job.pairs ? gsf__attention_grad_keys_pairs : gsf__attention_grad_keys;
+    job.run_block = job.pairs ? gsf__attention_grad_block_pairs : gsf__attention_grad_block;
+#if GSF__X86
+    job.multiply_packed = gsf__multiply_pairs;
+#endif
 #if GSF__AMX
-    job.tiles = d->bf16 && GSF__REACHES(ctx->cpu_level, AMX);
-    if (job.tiles) {
-        job.prepare_keys = gsf__attention_grad_keys_amx;
-        job.run_block = gsf__attention_grad_block_amx;
-    }
+    if (products == &gsf__linear_amx) job.multiply_packed = gsf__multiply_amx;
 #endif
     job.scratch_floats = gsf__attention_grad_lay_out(&job, NULL, &blocks);
     if (!gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &count))
