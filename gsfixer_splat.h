@@ -701,9 +701,13 @@ GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
 // A filter on final renders: renders the trained splats for these cameras, all of the same size, and has the fixer's restorer
 // clean up the frames as one clip, with the photos that it has in the loop, and exposes them as the photos' camera would have
 // (gsf_fix_desc.auto_exposure). color, confidence: `count` f32 images of that size with 3 and 1 channels; the splats stay as
-// they are. GSF_ERROR_INVALID_ARGUMENT without a restorer or within a round.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* fixer, const gsf_camera* cameras,
-                                                         size_t count, gsf_image* color, gsf_image* confidence);
+// they are. More fixers than one are copies, trained on the same photos with other seeds, which err differently: the frames
+// become the mean of what the restorer makes of each copy's renders and, the more it makes these differ, that of the renders
+// themselves. They may share a restorer, which one fixer keeps begun until it trains or is destroyed, and several do not.
+// GSF_ERROR_INVALID_ARGUMENT without fixers, without a restorer or within a round.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* fixers, size_t fixer_count,
+                                                         const gsf_camera* cameras, size_t count, gsf_image* color,
+                                                         gsf_image* confidence);
 // Checkpoint between steps. A fixer made from the same desc, views and initial splats continues from it bit-identically.
 GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* fixer, gsf_buffer* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* fixer, const char* name,
@@ -15023,17 +15027,12 @@ static void gsf__expose_view(gsf_fixer* f, const gsf_camera* camera, const gsf_i
             }
 }
 
-GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras, size_t count,
-                                           gsf_image* color, gsf_image* confidence) {
+// images: as of gsf__render_views.
+static gsf_result gsf__restore_views_of(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras, size_t count,
+                                        const int32_t* known, gsf_image* images, gsf_image* color, gsf_image* confidence) {
     gsf_restore_window window;
-    if (f->desc.rounds < 1 || f->restoring || count < 1 || count > 4096)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "restore: %zu views, without a restorer or within a round", count);
-    gsf_image* images = (gsf_image*)gsf_alloc_zeroed(ctx, count, 3 * sizeof *images);
-    int32_t* known = (int32_t*)gsf_alloc(ctx, count, sizeof *known);
-    gsf_result result = images && known ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; known && i < count; i++) known[i] = -1;
-    if (result == GSF_OK) result = gsf__render_views(ctx, f, cameras, count, images);
-    if (result == GSF_OK) result = gsf__open_references(ctx, f);
+    GSF__TRY(gsf__render_views(ctx, f, cameras, count, images));
+    GSF__TRY(gsf__open_references(ctx, f));
     memset(&window, 0, sizeof window);
     window.struct_size = sizeof window;
     window.frame_count = (int32_t)count;
@@ -15046,14 +15045,107 @@ GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* f, const
     window.alpha = f->limits.needs_alpha ? images + 2 * count : NULL;
     window.out_color = color;
     window.out_confidence = confidence;
-    gsf__lend_carrier(f, &window, images ? images + count : NULL);
-    if (result == GSF_OK) result = gsf_restore_clip(ctx, f->restorer, &window);
+    gsf__lend_carrier(f, &window, images + count);
+    GSF__TRY(gsf_restore_clip(ctx, f->restorer, &window));
     const int exposed = f->limits.needs_carried > 0 && f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0;
-    for (size_t i = 0; i < count && exposed && result == GSF_OK; i++)
+    for (size_t i = 0; i < count && exposed; i++)
         gsf__expose_view(f, cameras + i, images + i, images + 2 * count + i, color + i);
-    for (size_t i = 0; images && i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);
+    return GSF_OK;
+}
+
+/* What several copies make of one view. A restorer errs where it paints what nothing confirms, by the wrong depth for example,
+   and copies have other depths there: it makes them differ more than they did. So, with the variances v over the copies, each
+   the mean over cells of 16 x 16 pixels,
+       color = s mean(restored) + (1 - s) mean(renders)    s = min(1, (v(renders) + e) / (v(restored) + e)) */
+enum { GSF__COPIES_CELL = 16 };
+static const float gsf__copies_least = 1e-4f; // e: differences of 0.01 do not count
+
+typedef struct gsf__copies_pixel { float render[3], restored[3], spread[2], confidence; } gsf__copies_pixel;
+
+static void gsf__count_copy(float value, float number, float* mean, float* spread) { // spread: sum of squares about the mean
+    const float from_old = value - *mean;
+    *mean += from_old / number;
+    *spread += from_old * (value - *mean);
+}
+
+static void gsf__add_copy(gsf__copies_pixel* p, const gsf_image* render, const gsf_image* restored, const gsf_image* confidence,
+                          size_t number) { // from 1
+    for (int64_t y = 0; y < render->height; y++)
+        for (int64_t x = 0; x < render->width; x++, p++) {
+            float ignored = 0.0f;
+            for (int c = 0; c < 3; c++) {
+                gsf__count_copy(gsf__get_pixel(render, x, y, c), (float)number, &p->render[c], &p->spread[0]);
+                gsf__count_copy(gsf__get_pixel(restored, x, y, c), (float)number, &p->restored[c], &p->spread[1]);
+            }
+            gsf__count_copy(gsf__get_pixel(confidence, x, y, 0), (float)number, &p->confidence, &ignored);
+        }
+}
+
+static gsf_result gsf__mix_copies(gsf_context* ctx, const gsf__copies_pixel* pixels, size_t copies, gsf_image* color,
+                                  gsf_image* confidence) {
+    const int64_t width = color->width, height = color->height;
+    const int64_t across = (width + GSF__COPIES_CELL - 1) / GSF__COPIES_CELL;
+    const int64_t down = (height + GSF__COPIES_CELL - 1) / GSF__COPIES_CELL;
+    const float scale = 1.0f / (3.0f * (float)(copies - 1));
+    gsf_image spread, cells, shares, share;
+    memset(&spread, 0, sizeof spread);
+    cells = shares = share = spread;
+    gsf_result result = gsf_make_image(ctx, GSF_F32, width, height, 2, &spread);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, across, down, 2, &cells);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, across, down, 1, &shares);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 1, &share);
+    for (int64_t i = 0; result == GSF_OK && i < 2 * width * height; i++)
+        ((float*)spread.data)[i] = pixels[i / 2].spread[i % 2];
+    if (result == GSF_OK) result = gsf_resize_image(ctx, &spread, GSF_RESIZE_PIL_BILINEAR, &cells);
+    for (int64_t i = 0; result == GSF_OK && i < across * down; i++) {
+        const float* v = (const float*)cells.data + 2 * i;
+        const float kept = (v[0] * scale + gsf__copies_least) / (v[1] * scale + gsf__copies_least);
+        ((float*)shares.data)[i] = kept < 1.0f ? kept : 1.0f;
+    }
+    if (result == GSF_OK) result = gsf_resize_image(ctx, &shares, GSF_RESIZE_PIL_BILINEAR, &share);
+    for (int64_t i = 0; result == GSF_OK && i < width * height; i++) {
+        const gsf__copies_pixel* p = pixels + i;
+        const float s = ((const float*)share.data)[i];
+        for (int c = 0; c < 3; c++)
+            gsf__put_pixel(color, i % width, i / width, c, s * p->restored[c] + (1.0f - s) * p->render[c]);
+        gsf__put_pixel(confidence, i % width, i / width, 0, p->confidence);
+    }
+    gsf_destroy_image(ctx, &spread);
+    gsf_destroy_image(ctx, &cells);
+    gsf_destroy_image(ctx, &shares);
+    gsf_destroy_image(ctx, &share);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* fixers, size_t fixer_count,
+                                           const gsf_camera* cameras, size_t count, gsf_image* color, gsf_image* confidence) {
+    gsf_result result = fixer_count < 1 || count < 1 || count > 4096 ? GSF_ERROR_INVALID_ARGUMENT : GSF_OK;
+    for (size_t k = 0; k < fixer_count && result == GSF_OK; k++)
+        if (fixers[k]->desc.rounds < 1 || fixers[k]->restoring) result = GSF_ERROR_INVALID_ARGUMENT;
+    if (result != GSF_OK)
+        return gsf_fail(ctx, result, "restore: %zu views by %zu fixers, or one without a restorer or within a round", count,
+                        fixer_count);
+    const size_t size = (size_t)color->width * (size_t)color->height; // of a view; only copies need all views to have it
+    gsf_image* images = (gsf_image*)gsf_alloc_zeroed(ctx, count, 3 * sizeof *images);
+    int32_t* known = (int32_t*)gsf_alloc(ctx, count, sizeof *known);
+    gsf__copies_pixel* pixels = NULL;
+    if (fixer_count > 1 && size <= SIZE_MAX / count) // an overflow counts as out of memory
+        pixels = (gsf__copies_pixel*)gsf_alloc_zeroed(ctx, size * count, sizeof *pixels);
+    if (!images || !known || (fixer_count > 1 && !pixels)) result = GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; known && i < count; i++) known[i] = -1;
+    for (size_t k = 0; k < fixer_count && pixels; k++) gsf__close_references(ctx, fixers[k]);
+    for (size_t k = 0; k < fixer_count && result == GSF_OK; k++) {
+        result = gsf__restore_views_of(ctx, fixers[k], cameras, count, known, images, color, confidence);
+        for (size_t i = 0; i < count && pixels && result == GSF_OK; i++)
+            gsf__add_copy(pixels + i * size, images + i, color + i, confidence + i, k + 1);
+        for (size_t i = 0; i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);
+        if (pixels) gsf__close_references(ctx, fixers[k]); // the next copy may have the same restorer
+    }
+    for (size_t i = 0; i < count && pixels && result == GSF_OK; i++)
+        result = gsf__mix_copies(ctx, pixels + i * size, fixer_count, color + i, confidence + i);
     gsf_free(ctx, images);
     gsf_free(ctx, known);
+    gsf_free(ctx, pixels);
     return result;
 }
 

@@ -74,6 +74,11 @@ static const option_spec option_specs[] = {
      "clean up the renders with the training views (--views) of the scene: a filter, the splats stay as they are"},
     {"--filtered", FLAG, AT(filtered), 0, 0, NULL, "fix",
      "have the restorer clean up the final renders of the held-out views, too: filtered/, and figures of their own"},
+    {"--copies", WHOLE, AT(copies), 1, 16, "N", "fix",
+     "--filtered: train N - 1 copies more, with the seeds that follow, copies/2.ply and so on, and make filtered/ from all of\n"
+     "them, as they err differently (default 1)"},
+    {"--with", TEXT, AT(with), 0, 0, "FILE,...", "render",
+     "--restorer: splats of the same photos trained with other seeds; the frames are made from all of them"},
     {"--fixed-exposure", FLAG, AT(fixed_exposure), 0, 0, NULL, "fix render",
      "what the restorer cleans up (fix: with --filtered) keeps the exposure of the splats; by default, frames of warp and\n"
      "mini are exposed as the photos' camera would have, if that chose exposures by what it saw"},
@@ -955,27 +960,45 @@ typedef struct render_filter {
     gsfix_split split;
     gsf_train_view* views;
     gsf_restorer restorer;
-    gsf_fixer* fixer;
+    gsf_fixer* fixers[GSFIX_COPIES_MOST]; // of the splats, and of those of --with
+    size_t fixer_count;
 } render_filter;
+
+static gsf_result add_to_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats* splats, const gsf_render_desc* desc,
+                                render_filter* f) {
+    gsf_fix_desc fix = gsf_splat_resolve_few_view_desc(scene, f->split.train_count, GSF_QUALITY_BALANCED);
+    fix.train.render = *desc;
+    fix.train.render.antialiased = splats->antialiased;
+    if (!app->o.background) memcpy(fix.train.render.background, splats->background, sizeof splats->background);
+    if (app->o.fixed_exposure) fix.auto_exposure = -1.0f;
+    fix.train.seed = app->o.seed;
+    return gsf_splat_make_fixer(&app->ctx, &fix, f->views, f->split.train_count, splats, &f->restorer,
+                                &f->fixers[f->fixer_count++]);
+}
 
 static gsf_result open_filter(gsfix_app* app, gsf_scene* scene, const gsf_splats* splats, const gsf_render_desc* desc,
                               render_filter* f) {
     int present;
     gsf_result result = gsfix_split_scene(app, scene, &f->split);
-    gsf_fix_desc fix = gsf_splat_resolve_few_view_desc(scene, f->split.train_count, GSF_QUALITY_BALANCED);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &f->restorer, &present);
     if (result == GSF_OK)
         result = gsf_splat_load_train_views(&app->ctx, scene, f->split.train, f->split.train_count, &f->views);
-    fix.train.render = *desc;
-    if (app->o.fixed_exposure) fix.auto_exposure = -1.0f;
-    fix.train.seed = app->o.seed;
-    if (result == GSF_OK)
-        result = gsf_splat_make_fixer(&app->ctx, &fix, f->views, f->split.train_count, splats, &f->restorer, &f->fixer);
+    if (result == GSF_OK) result = add_to_filter(app, scene, splats, desc, f);
+    for (const char* p = app->o.with ? app->o.with : ""; *p && result == GSF_OK; p += *p == ',') {
+        const gsfix_path path = gsfix_pathf("%.*s", (int)strcspn(p, ","), p);
+        gsf_splats copy = {0};
+        p += strcspn(p, ",");
+        if (f->fixer_count == GSFIX_COPIES_MOST)
+            return gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--with: more than %d files", GSFIX_COPIES_MOST - 1);
+        result = gsf_splat_load(&app->ctx, path.s, &copy);
+        if (result == GSF_OK) result = add_to_filter(app, scene, &copy, desc, f);
+        gsf_splat_destroy(&app->ctx, &copy);
+    }
     return result;
 }
 
 static void close_filter(gsfix_app* app, render_filter* f) {
-    gsf_splat_destroy_fixer(&app->ctx, f->fixer);
+    for (size_t i = 0; i < f->fixer_count; i++) gsf_splat_destroy_fixer(&app->ctx, f->fixers[i]);
     gsf_destroy_restorer(&app->ctx, &f->restorer);
     gsf_free(&app->ctx, f->views);
     gsfix_free_split(app, &f->split);
@@ -988,7 +1011,7 @@ static gsf_result filter_one(gsfix_app* app, const render_filter* f, const gsf_c
     gsf_image color, confidence = {0};
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
-    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, f->fixer, camera, 1, &color, &confidence);
+    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, f->fixers, f->fixer_count, camera, 1, &color, &confidence);
     if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name).s, &color);
     if (result == GSF_OK) result = gsfix_add_frame(video, &color);
     gsf_destroy_image(ctx, &color);
@@ -1076,6 +1099,7 @@ static int run_render(gsfix_app* app) {
         return gsfix_misused(app, "--restorer %s: render takes none|warp|mini[:FILE]", r);
     if (filtered && !app->o.scene) return gsfix_misused(app, "--restorer: needs the photos of a --scene");
     if (app->o.fixed_exposure && !filtered) return gsfix_misused(app, "--fixed-exposure: needs a --restorer");
+    if (app->o.with && !filtered) return gsfix_misused(app, "--with: needs a --restorer");
     if (!filtered && !app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
     if (app->o.depth_as && !depth_is_exr(app) && !depth_is_png(app))
         return gsfix_misused(app, "--depth-as %s: one of exr and png16", app->o.depth_as);

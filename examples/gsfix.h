@@ -16,12 +16,12 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features, *lora;
-    const char *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
+    const char *scene, *path, *with, *depth_as, *method, *kind, *refs, *which, *models, *prompt, *ref_features, *save_features;
+    const char *lora, *caption, *model, *solver, *photo_masks, *background, *kinds, *task;
     const char *restorers, *trajectories, *inits, *conditions, *tables, *benchmark, *screenshot, *video;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames, list_tasks, filtered, fixed_exposure;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
-    int clean_iterations, seeds, spz_version, fps;
+    int clean_iterations, seeds, spz_version, fps, copies;
     double restorer_timeout, guidance, guidance_until, strength, block_cache, orbit;
     uint64_t seed;
     const char** inputs;
@@ -308,8 +308,10 @@ typedef struct gsfix_flown { int32_t round, window, reference; double center[3],
 typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // a frame whose images are in DIR/report
 
 enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_CHECKPOINT, GSFIX_SAVE, GSFIX_COMPARE,
-       GSFIX_STAGES };
+       GSFIX_COPIES, GSFIX_STAGES };
 extern const char* const gsfix_stage_names[GSFIX_STAGES];
+
+enum { GSFIX_COPIES_MOST = 16 }; // with the run itself, see --copies
 
 typedef struct gsfix_history { // record of the run, stored in the checkpoint next to the fixer's state
     double seconds[GSFIX_STAGES], seconds_total;
@@ -335,6 +337,7 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
     gsfix_score mean, without, filtered;
     const gsfix_score* views; // one per test view
     const gsfix_score* filtered_views; // likewise, of the renders that the restorer has cleaned up; NULL: --filtered not given
+    size_t copies;            // that these were made from, the run itself included
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;
     gsf_render_desc render;   // what the splats were trained with, the near plane included

@@ -192,13 +192,14 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
         return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     if (app->o.filtered && !has_restorer(app)) return gsfix_misused(app, "--filtered: needs a --restorer");
     if (app->o.fixed_exposure && !app->o.filtered) return gsfix_misused(app, "--fixed-exposure: needs --filtered");
+    if (app->o.copies > 1 && !app->o.filtered) return gsfix_misused(app, "--copies: needs --filtered");
     return gsfix_check_restorer(app);
 }
 
 // ---- a run -----------------------------------------------------------------------
 
 const char* const gsfix_stage_names[GSFIX_STAGES] = {"init", "train", "render", "restore", "distill",
-                                                         "checkpoint", "save", "compare"};
+                                                         "checkpoint", "save", "compare", "copies"};
 
 typedef struct fix_run {
     gsfix_app* app;
@@ -216,6 +217,7 @@ typedef struct fix_run {
     int comparing; // set during the run without repair, the first one of --compare
     const gsfix_fix_task* task; // of another command, or NULL
     gsf_fixer* fixer;
+    gsf_fixer* copies[GSFIX_COPIES_MOST]; // those of --copies, for the filtered views; the first one is `fixer`
     gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
@@ -227,6 +229,10 @@ typedef struct fix_run {
     int32_t iteration, iterations, eval_every, checkpoint_every;
     double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds for the last one and for all; end time of the last
 } fix_run;
+
+static size_t copy_count(const fix_run* run) { return run->app->o.copies > 1 ? (size_t)run->app->o.copies : 1; }
+
+static gsfix_path copy_file(int copy) { return gsfix_pathf("copies/%d.ply", copy + 1); } // copy: from 1; 0 is the run itself
 
 static void add_seconds(fix_run* run, int stage, double* since) {
     const double now = gsfix_now();
@@ -364,7 +370,7 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
     return result;
 }
 
-// Has the restorer clean up the renders of all held-out views, and scores them.
+// Has the restorer clean up the renders of all held-out views, of all copies, and scores them.
 static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
     gsf_context* ctx = run->ctx;
     gsf_result result = GSF_OK;
@@ -374,7 +380,8 @@ static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
         gsf_image color, confidence = {0};
         result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
-        if (result == GSF_OK) result = gsf_splat_restore_views(ctx, run->fixer, camera, 1, &color, &confidence);
+        if (result == GSF_OK)
+            result = gsf_splat_restore_views(ctx, run->copies, copy_count(run), camera, 1, &color, &confidence);
         if (result == GSF_OK) gsfix_clamp(&color);
         if (result == GSF_OK) result = score_view(run, i, &color, 1, scores + i);
         if (result == GSF_OK)
@@ -784,10 +791,8 @@ static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, s
 }
 
 // Replaces the fixer by a new one, with the restorer unless this is the run without repair.
-static gsf_result start_fixer(fix_run* run) {
+static gsf_result make_fixer(fix_run* run, const gsf_splats* initial, int copy, const gsf_restorer* restorer, gsf_fixer** out) {
     gsf_context* ctx = run->ctx;
-    gsf_splat_destroy_fixer(ctx, run->fixer);
-    run->fixer = NULL;
     const size_t n = run->split.train_count;
     gsf_train_view* views = NULL;
     gsf_result result = gsf_splat_load_train_views(ctx, &run->scene, run->split.train, n, &views);
@@ -797,10 +802,16 @@ static gsf_result start_fixer(fix_run* run) {
     desc.point_count = run->scene.point_count;
     desc.path = run->path;
     desc.path_count = run->path_count;
-    result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
-                                  run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
+    desc.train.seed += (uint64_t)copy;
+    result = gsf_splat_make_fixer(ctx, &desc, views, n, initial, restorer, out);
     gsf_free(ctx, views);
     return result;
+}
+
+static gsf_result start_fixer(fix_run* run) {
+    gsf_splat_destroy_fixer(run->ctx, run->fixer);
+    run->fixer = NULL;
+    return make_fixer(run, &run->initial, 0, run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
 }
 
 static gsf_result resume(fix_run* run) {
@@ -876,6 +887,7 @@ static gsf_result open_fix_out(fix_run* run) {
         if (result == GSF_OK && app->o.compare) result = gsfix_claim(app, "report/without/%s.png", stem.s);
         if (result == GSF_OK && app->o.filtered) result = gsfix_claim(app, "filtered/%s.png", stem.s);
     }
+    for (int i = 1; i < app->o.copies && result == GSF_OK; i++) result = gsfix_claim(app, "%s", copy_file(i).s);
     for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app) && !run->task; i++)
         result = gsfix_claim(app, "%s", repair[i]);
     if (result == GSF_OK && run->task) result = run->task->claim_fn(app, run->task->user);
@@ -925,6 +937,8 @@ static gsf_result prepare(fix_run* run) {
     run->comparing = app->o.compare;
     if (run->resuming) result = resume(run);
     else result = gsfix_remove_output(app, "checkpoint");
+    for (int i = 1; i < app->o.copies && result == GSF_OK && !run->resuming; i++)
+        result = gsfix_remove_output(app, copy_file(i).s); // of another run
     if (result == GSF_OK && !run->resuming && run->comparing) result = start_fixer(run);
     if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
     if (result == GSF_OK) tell_start(run);
@@ -1028,13 +1042,17 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
     return result;
 }
 
+static double all_steps(const fix_run* run) { // of the run without repair, the run itself and its copies
+    return (double)run->iterations * ((run->app->o.compare ? 1.0 : 0.0) + (double)copy_count(run));
+}
+
 static void show_step(fix_run* run, const gsf_fix_stats* stats) {
     const gsfix_history* h = &run->history;
     const double psnr = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
     char held_out[48] = "";
     if (!isnan(psnr)) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
-    const double trainings = run->app->o.compare ? 2.0 : 1.0, all = trainings * run->iterations;
-    const double done = run->iteration + (run->comparing ? 0.0 : all - run->iterations);
+    const double before = run->app->o.compare && !run->comparing ? run->iterations : 0.0, done = before + run->iteration;
+    const double all = all_steps(run);
     if (stats->stage == GSF_FIX_TRAIN)
         gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s",
                        run->comparing ? "without repair: " : "",
@@ -1100,6 +1118,56 @@ static gsf_result run_trainings(fix_run* run) {
         if (result != GSF_OK) return result;
     }
     return run_loop(run);
+}
+
+// ---- copies ----------------------------------------------------------------------
+
+// Trains a copy as a run with its seed would, and saves its splats.
+static gsf_result train_copy(fix_run* run, int copy) {
+    gsf_context* ctx = run->ctx;
+    const int count = (int)copy_count(run);
+    gsf_initial_desc start = run->setup.initial;
+    gsf_splats initial = {0};
+    gsf_fixer* fixer = NULL;
+    start.seed += (uint64_t)copy;
+    gsf_result result = gsf_splat_make_initial_splats(ctx, &run->scene, run->split.train, run->split.train_count, &start,
+                                                      &initial, NULL);
+    if (result == GSF_OK) result = make_fixer(run, &initial, copy, &run->restorer, &fixer);
+    gsf_splat_destroy(ctx, &initial);
+    while (result == GSF_OK) {
+        gsf_fix_stats stats;
+        result = gsf_splat_step_fixer(ctx, fixer, &stats);
+        if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
+        if (stats.stage == GSF_FIX_TRAIN)
+            gsfix_progress(run->app, all_steps(run) - (double)run->iterations * (count - copy) + stats.train.iteration,
+                           all_steps(run), "copy %d of %d: step %d of %d  loss %.4f  %zu splats", copy + 1, count,
+                           (int)stats.train.iteration, (int)run->iterations, stats.train.loss, stats.train.splats);
+    }
+    if (result == GSF_OK) {
+        gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(fixer));
+        view.antialiased = run->setup.fix.train.render.antialiased;
+        result = gsf_splat_save(ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(copy).s).s, &view, NULL);
+    }
+    if (result == GSF_ERROR_CANCELLED)
+        result = gsf_fail(ctx, result, "stopped in copy %d of %d; --resume goes on from %s/checkpoint", copy + 1, count,
+                          run->app->o.out);
+    gsf_splat_destroy_fixer(ctx, fixer);
+    return result;
+}
+
+// Those that an interrupted run has left are not trained again.
+static gsf_result make_copies(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsf_result result = GSF_OK;
+    run->copies[0] = run->fixer;
+    for (int i = 1; i < (int)copy_count(run) && result == GSF_OK; i++) {
+        gsf_splats splats = {0};
+        if (!gsfix_has_output(run->app, copy_file(i).s)) result = train_copy(run, i);
+        if (result == GSF_OK) result = gsf_splat_load(ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(i).s).s, &splats);
+        if (result == GSF_OK) result = make_fixer(run, &splats, i, &run->restorer, &run->copies[i]);
+        gsf_splat_destroy(ctx, &splats);
+    }
+    return result;
 }
 
 // ---- results ---------------------------------------------------------------------
@@ -1180,6 +1248,7 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     if (r->filtered_views) {
         gsfix_json_begin(ctx, t, "filtered", '{');
         write_scores(ctx, t, "", &r->filtered);
+        gsfix_json_number(ctx, t, "copies", (double)r->copies);
         gsfix_json_end(ctx, t, '}');
     }
     gsfix_json_text(ctx, t, "measured",
@@ -1235,8 +1304,8 @@ static void print_results(fix_run* run, const gsfix_result* r) {
                         r->without.psnr,
                         r->without.ssim, r->mean.psnr - r->without.psnr);
         if (r->filtered_views)
-            gsfix_print(app, "filtered   PSNR %.3f dB  SSIM %.4f  (the same renders, cleaned up by the restorer)",
-                        r->filtered.psnr, r->filtered.ssim);
+            gsfix_print(app, "filtered   PSNR %.3f dB  SSIM %.4f  (the same renders%s, cleaned up by the restorer)",
+                        r->filtered.psnr, r->filtered.ssim, r->copies > 1 ? " and those of the copies" : "");
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
@@ -1317,8 +1386,11 @@ static gsf_result finish(fix_run* run) {
     add_seconds(run, GSFIX_RENDER, &clock);
     r.mean = mean_score(views, tests);
     if (run->app->o.filtered && tests) {
+        if (result == GSF_OK) result = make_copies(run);
+        add_seconds(run, GSFIX_COPIES, &clock);
         if (result == GSF_OK) result = evaluate_filtered(run, views + tests);
         r.filtered_views = views + tests;
+        r.copies = copy_count(run);
         r.filtered = mean_score(views + tests, tests);
         add_seconds(run, GSFIX_RESTORE, &clock);
     }
@@ -1339,6 +1411,7 @@ static gsf_result finish(fix_run* run) {
 
 static void free_run(fix_run* run) {
     gsf_context* ctx = run->ctx;
+    for (int i = 1; i < GSFIX_COPIES_MOST; i++) gsf_splat_destroy_fixer(ctx, run->copies[i]);
     gsf_splat_destroy_fixer(ctx, run->fixer);
     gsf_destroy_restorer(run->ctx, &run->restorer);
     gsf_splat_destroy(ctx, &run->initial);

@@ -116,14 +116,17 @@ static gsf_result put_view(page* p, size_t i) {
     const gsf_scene_view* view = &r->scene->views[r->split->test[i]];
     const int has_without = r->history->has_without;
     const gsfix_path stem = gsfix_view_stem(r->scene, r->split->test[i]);
-    gsf_image without = {0}, with = {0};
+    gsf_image without = {0}, with = {0}, filtered = {0};
     gsf_result result = gsf_load_image(p->ctx, gsfix_pathf("%s/test/%s.png", r->out, stem.s).s, 3, &with);
     if (result == GSF_OK && has_without)
         result = gsf_load_image(p->ctx, gsfix_pathf("%s/report/without/%s.png", r->out, stem.s).s, 3, &without);
+    if (result == GSF_OK && r->filtered_views)
+        result = gsf_load_image(p->ctx, gsfix_pathf("%s/filtered/%s.png", r->out, stem.s).s, 3, &filtered);
     gsfix_put(p, "<figure class=card><div class=cmp style=\"aspect-ratio:%d/%d\">", (int)with.width, (int)with.height);
     if (result == GSF_OK) result = put_pane(p, "photo", has_without ? "" : "left", "photo", &view->image, NULL);
     if (result == GSF_OK && has_without) result = put_pane(p, "without", "left", "without repair", &without, NULL);
     if (result == GSF_OK) result = put_pane(p, "with", "right", has_without ? "with repair" : "result", &with, NULL);
+    if (result == GSF_OK && r->filtered_views) result = put_pane(p, "filtered", "", "filtered", &filtered, NULL);
     if (result == GSF_OK && has_without) result = put_pane(p, "error-without", "", "error without", &without, &view->image);
     if (result == GSF_OK) result = put_pane(p, "error", "", has_without ? "error with" : "error", &with, &view->image);
     gsfix_put_raw(p, "<i class=bar></i><input type=range min=0 max=1000 value=500 aria-label=\"divider between the two pictures\"></div>"
@@ -134,9 +137,11 @@ static gsf_result put_view(page* p, size_t i) {
     put_change(p, "PSNR", was ? was->psnr : NAN, r->views[i].psnr, 2, " dB");
     put_change(p, "seen", was ? was->psnr_seen : NAN, r->views[i].psnr_seen, 2, " dB");
     put_change(p, "SSIM", was ? was->ssim : NAN, r->views[i].ssim, 3, "");
+    if (r->filtered_views) put_change(p, "filtered", NAN, r->filtered_views[i].psnr, 2, " dB");
     gsfix_put_raw(p, "</figcaption></figure>\n");
     gsf_destroy_image(p->ctx, &without);
     gsf_destroy_image(p->ctx, &with);
+    gsf_destroy_image(p->ctx, &filtered);
     return result;
 }
 
@@ -160,6 +165,12 @@ static gsf_result put_views(page* p) {
         gsfix_put(p, " <em>Without repair</em> is a second run from the same start and seed with the same number of steps (%d): the "
                "difference, %+.2f dB on average, is what the repair alone contributes.",
             (int)r->iterations, r->mean.psnr - r->without.psnr);
+    if (r->filtered_views) {
+        gsfix_put_raw(p, " <em>Filtered</em> are the same renders");
+        if (r->copies == 2) gsfix_put_raw(p, ", together with those of a copy trained with another seed,");
+        if (r->copies > 2) gsfix_put(p, ", together with those of %zu copies trained with other seeds,", r->copies - 1);
+        gsfix_put(p, " cleaned up by the restorer, %+.2f dB on average; the splats stay as they are.", r->filtered.psnr - r->mean.psnr);
+    }
     gsfix_put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
     if (r->history->has_without)
         gsfix_put_raw(p, "<button data-l=without data-r=with class=on>without | with repair</button><button data-l=photo data-r=with>photo | "
@@ -168,6 +179,9 @@ static gsf_result put_views(page* p) {
     else
         gsfix_put_raw(p, "<button data-l=photo data-r=with class=on>photo | result</button><button data-l=with data-r=error>result | error"
                    "</button>");
+    if (r->filtered_views)
+        gsfix_put(p, "<button data-l=with data-r=filtered>%s | filtered</button><button data-l=photo data-r=filtered>photo | filtered"
+                  "</button>", r->history->has_without ? "with repair" : "result");
     gsfix_put_raw(p, "</div>\n");
     gsfix_put_legend(p);
     gsfix_put_raw(p, "<div class=\"cards\">\n");
@@ -248,6 +262,7 @@ static void put_tiles(page* p) {
     put_tile(p, "PSNR, held-out", r->mean.psnr, has_without ? r->without.psnr : NAN, 2, " dB");
     put_tile(p, "PSNR, seen pixels", r->mean.psnr_seen, has_without ? r->without.psnr_seen : NAN, 2, " dB");
     put_tile(p, "SSIM, held-out", r->mean.ssim, has_without ? r->without.ssim : NAN, 3, "");
+    if (r->filtered_views) put_tile(p, "PSNR, filtered views", r->filtered.psnr, NAN, 2, " dB");
     gsfix_put(p, "<div class=tile><dt>photos used</dt><dd>%zu<small> of %zu</small></dd></div>\n", r->split->train_count, r->scene->view_count);
     gsfix_put_raw(p, "<div class=tile><dt>splats</dt><dd>");
     put_count(p, (double)r->splats->count);
@@ -344,7 +359,8 @@ static void put_seconds(page* p) {
     static const char* const what[GSFIX_STAGES] = {"loading, visible points, initial splats", "training before the first round",
                                                    "rendering and measuring held-out views", "rendering and repairing path frames",
                                                    "training with repaired frames", "writing checkpoints for --resume",
-                                                   "writing images and splats", "run without repair, for comparison"};
+                                                   "writing images and splats", "run without repair, for comparison",
+                                                   "copies with other seeds, for the filtered views"};
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];
@@ -375,6 +391,7 @@ static void put_table(page* p) {
     if (has_seen) gsfix_put_raw(p, has_without ? "<th>with, seen pixels, dB" : "<th>seen pixels, dB");
     if (has_without) gsfix_put_raw(p, "<th>SSIM without");
     gsfix_put_raw(p, has_without ? "<th>with" : "<th>SSIM");
+    if (r->filtered_views) gsfix_put_raw(p, "<th>PSNR filtered, dB<th>SSIM filtered");
     gsfix_put_raw(p, "</tr></thead><tbody>");
     for (size_t i = 0; i <= r->split->test_count; i++) {
         const int mean = i == r->split->test_count;
@@ -387,6 +404,11 @@ static void put_table(page* p) {
         if (has_seen) put_cell(p, now->psnr_seen, 2);
         if (has_without) put_cell(p, was->ssim, 4);
         put_cell(p, now->ssim, 4);
+        if (r->filtered_views) {
+            const gsfix_score* filtered = mean ? &r->filtered : &r->filtered_views[i];
+            put_cell(p, filtered->psnr, 2);
+            put_cell(p, filtered->ssim, 4);
+        }
         gsfix_put_raw(p, "</tr>");
     }
     gsfix_put_raw(p, "</tbody></table></div></section>\n");
@@ -656,7 +678,7 @@ static const char* const style[] = { // in pieces, since C guarantees string lit
     "canvas{display:block;background:#17181c;width:100%;height:min(60vh,480px);cursor:grab;touch-action:pan-y}.zoom{position:absolute;right:10px;top:10px;display:flex;gap:6px}",
     ".zoom button{width:34px;height:34px;padding:0;font-size:18px}",
     ".stages{display:flex;height:26px;border-radius:6px;overflow:hidden;gap:1px;margin:12px 0}.stages i{min-width:2px;flex-basis:0}",
-    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#c9a227}.s6{background:#a3788f}.s7{background:#5a6b8c}",
+    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#c9a227}.s6{background:#a3788f}.s7{background:#5a6b8c}.s8{background:#2f9aa8}",
     ".dot{display:inline-block;width:11px;height:11px;border-radius:3px;margin-right:8px}",
     "table{border-collapse:collapse;font-size:14.5px;font-variant-numeric:tabular-nums}td,th{padding:4px 16px 4px 0;text-align:left;vertical-align:top}",
     "th{font-weight:600;color:var(--soft);border-bottom:1px solid var(--line)}th+th,td.num{text-align:right}.mean td{border-top:1px solid var(--line);font-weight:650}",

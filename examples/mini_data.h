@@ -184,7 +184,7 @@ static gsf_result data_finish(gsf_context* ctx, gsf_fixer* fixer, const gsf_scen
     for (size_t i = 0; i < 2 * taken && result == GSF_OK; i++)
         result = gsf_make_image(ctx, GSF_F32, cameras[0].width, cameras[0].height, i < taken ? 3 : 1, &images[i]);
     p->final = 1;
-    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, fixer, cameras, taken, images, images + taken);
+    if (result == GSF_OK) result = gsf_splat_restore_views(ctx, &fixer, 1, cameras, taken, images, images + taken);
     for (size_t i = 0; i < 2 * taken; i++) gsf_destroy_image(ctx, &images[i]);
     return result;
 }

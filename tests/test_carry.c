@@ -292,7 +292,7 @@ static void filter_frames(gsf_context* ctx, shots* c, float auto_exposure, doubl
     probe_init(&p, c, 0);
     gsf_fixer* fixer = make_fixer(ctx, c, &p, auto_exposure);
     if (fixer && finish(ctx, fixer))
-        CHECK_OK(ctx, gsf_splat_restore_views(ctx, fixer, cameras, 2, colors, confidences));
+        CHECK_OK(ctx, gsf_splat_restore_views(ctx, &fixer, 1, cameras, 2, colors, confidences));
     for (int i = 0; i < 2; i++) means[i] = mean_of(colors + i);
     gsf_splat_destroy_fixer(ctx, fixer);
     gsf_splat_destroy(ctx, &c->start);

@@ -666,8 +666,6 @@ static void test_loop(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-// Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
-// refused immediately, unless no rounds are requested.
 // A filter on final renders gives the restorer's frames and changes nothing: a run with calls of it has the same splats.
 static void test_restore_views(gsf_context* ctx) {
     static repair r;
@@ -695,14 +693,14 @@ static void test_restore_views(gsf_context* ctx) {
         const int busy = stats.stage == GSF_FIX_PLAN || (stats.stage == GSF_FIX_RESTORE && stats.window < stats.windows);
         within += busy;
         const gsf_result expected = busy || stats.stage == GSF_FIX_RESTORE ? GSF_ERROR_INVALID_ARGUMENT : GSF_OK;
-        CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences), expected);
+        CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, &filtered, 1, cameras, 2, colors, confidences), expected);
         CHECK(r.begun - begun <= 1);
         if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, filtered, &stats))) break;
     }
     CHECK(within > 0);
     while (!run_steps(ctx, plain, 1, NULL)) continue;
     CHECK(same_splats(plain, filtered));
-    CHECK_OK(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 2, colors, confidences));
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, &filtered, 1, cameras, 2, colors, confidences));
     gsf_render_output out;
     memset(&out, 0, sizeof out);
     out.color = gsf_wrap_image(truth, GSF_F32, WIDTH, HEIGHT, 3);
@@ -710,8 +708,8 @@ static void test_restore_views(gsf_context* ctx) {
         CHECK_OK(ctx, gsf_splat_render(ctx, r.rasterizer, &r.truth, &cameras[i], NULL, &out));
         CHECK(memcmp(truth, color[i], sizeof truth) == 0 && confidence[i][0] == 0.8f);
     }
-    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, filtered, cameras, 0, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, trained, cameras, 2, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, &filtered, 1, cameras, 0, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, &trained, 1, cameras, 2, colors, confidences), GSF_ERROR_INVALID_ARGUMENT);
     gsf_splat_destroy_fixer(ctx, plain);
     gsf_splat_destroy_fixer(ctx, filtered);
     gsf_splat_destroy_fixer(ctx, trained);
@@ -719,6 +717,107 @@ static void test_restore_views(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+// A restorer that adds a grey, another one to the frames of each copy, and refuses to begin twice.
+typedef struct tinter { float add[2]; int open, calls; } tinter;
+
+static gsf_result tint_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                             gsf_restorer_info* out) {
+    (void)user; (void)ctx; (void)frames; (void)width; (void)height;
+    out->frame_count_min = out->frame_count_step = out->width_multiple = out->height_multiple = 1;
+    return GSF_OK;
+}
+
+static gsf_result tint_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    tinter* t = (tinter*)user;
+    (void)references; (void)count;
+    if (t->open) return gsf_fail(ctx, GSF_ERROR_RESTORER, "begun twice");
+    t->open = 1;
+    return GSF_OK;
+}
+
+static gsf_result tint_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    tinter* t = (tinter*)user;
+    const float add = t->add[t->calls++ % 2];
+    (void)ctx;
+    for (int32_t i = 0; i < window->frame_count; i++)
+        for (int k = 0; k < PIXELS; k++) {
+            for (int c = 0; c < 3; c++)
+                ((float*)window->out_color[i].data)[3 * k + c] = ((const float*)window->color[i].data)[3 * k + c] + add;
+            ((float*)window->out_confidence[i].data)[k] = add;
+        }
+    return GSF_OK;
+}
+
+static void tint_end(void* user, gsf_context* ctx) {
+    (void)ctx;
+    ((tinter*)user)->open = 0;
+}
+
+// Views of several fixers: the mean of what the restorer makes of each one's renders, and the less of it the more this differs
+// beyond the renders.
+static void test_copies(gsf_context* ctx) {
+    static repair r;
+    static float color[2][3 * PIXELS], mean[2][3 * PIXELS], confidence[2][PIXELS], render[2][3 * PIXELS];
+    tinter tint = {{0.0f, 0.0f}, 0, 0};
+    gsf_fixer *twins[2], *others[2], *plain, *wrong[2];
+    repair_setup(ctx, &r);
+    gsf_restorer restorer = r.restorer;
+    restorer.user = &tint;
+    restorer.query_fn = tint_query;
+    restorer.begin_fn = tint_begin;
+    restorer.restore_fn = tint_restore;
+    restorer.end_fn = tint_end;
+    const gsf_fix_desc desc = repair_desc();
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &twins[0]));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &twins[1]));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.truth, &restorer, &others[1]));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, NULL, &plain));
+    others[0] = wrong[0] = twins[0];
+    wrong[1] = plain;
+    const gsf_camera cameras[2] = {around(0.4, 0.1), around(-0.3, 0.0)};
+    gsf_image colors[2], means[2], confidences[2], renders[2];
+    for (int i = 0; i < 2; i++) {
+        colors[i] = gsf_wrap_image(color[i], GSF_F32, WIDTH, HEIGHT, 3);
+        means[i] = gsf_wrap_image(mean[i], GSF_F32, WIDTH, HEIGHT, 3);
+        renders[i] = gsf_wrap_image(render[i], GSF_F32, WIDTH, HEIGHT, 3);
+        confidences[i] = gsf_wrap_image(confidence[i], GSF_F32, WIDTH, HEIGHT, 1);
+    }
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, twins, 1, cameras, 2, colors, confidences));
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, others + 1, 1, cameras, 2, renders, confidences), GSF_ERROR_RESTORER);
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, others, 2, cameras, 2, means, confidences)); // this leaves it closed
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, others + 1, 1, cameras, 2, renders, confidences));
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, others, 2, cameras, 2, means, confidences));
+    int differs = 0;
+    for (int i = 0; i < 2; i++)
+        for (int k = 0; k < 3 * PIXELS; k++) {
+            differs += fabsf(color[i][k] - render[i][k]) > 0.05f;
+            CHECK_NEAR(mean[i][k], 0.5 * ((double)color[i][k] + (double)render[i][k]), 1e-6);
+        }
+    CHECK(differs > PIXELS);
+    static const float adds[][2] = {{0.2f, 0.2f}, {0.0f, 0.2f}, {0.0f, 0.02f}};
+    for (size_t n = 0; n < sizeof adds / sizeof *adds; n++) {
+        const double apart = 0.5 * ((double)adds[n][1] - (double)adds[n][0]), middle = (double)adds[n][0] + apart;
+        const double share = 1e-4 / (2.0 * apart * apart + 1e-4);
+        memcpy(tint.add, adds[n], sizeof tint.add);
+        tint.calls = 0;
+        CHECK_OK(ctx, gsf_splat_restore_views(ctx, twins, 2, cameras, 2, means, confidences));
+        for (int i = 0; i < 2; i++)
+            for (int k = 0; k < 3 * PIXELS; k++) {
+                CHECK_NEAR(mean[i][k], (double)color[i][k] + share * middle, 2e-6);
+                CHECK_NEAR(confidence[i][k / 3], middle, 1e-6);
+            }
+    }
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, twins, 0, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, wrong, 2, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK(!tint.open);
+    for (int i = 0; i < 2; i++) gsf_splat_destroy_fixer(ctx, twins[i]);
+    gsf_splat_destroy_fixer(ctx, others[1]);
+    gsf_splat_destroy_fixer(ctx, plain);
+    repair_teardown(ctx, &r);
+}
+
+// Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
+// refused immediately, unless no rounds are requested.
 static void test_rigs(gsf_context* ctx) {
     for (int rig = 0; rig < 2; rig++) {
         static repair r;
@@ -1220,6 +1319,7 @@ int main(void) {
     test_explaining_restorer(&ctx);
     test_loop(&ctx);
     test_restore_views(&ctx);
+    test_copies(&ctx);
     test_rigs(&ctx);
     test_given_path(&ctx);
     test_native_frames(&ctx);

@@ -82,7 +82,26 @@ cmp -s clean/frame_001.png plain/frame_001.png && fail "the filter changes nothi
 for frame in fixed/*.png; do # photos too small for stereo, so that nothing tells of their exposures
     cmp -s "$frame" "clean/$(basename "$frame")" || fail "exposed without evidence: $frame"
 done
+
+# Copies: runs with the seeds that follow. Their splats are kept, and trained again by --resume where they are missing.
+common="--views 3 --iterations 40 --init tracks --restorer mini:learned"
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 > /dev/null 2>&1 || fail "--copies"
+"$gsfix" fix "$scene" --out next $common --seed 5 > /dev/null 2>&1
+cmp copies/copies/2.ply next/splats.ply || fail "a copy is not the run with its seed"
+cp -r copies/filtered copies/copies/2.ply .
+rm copies/copies/2.ply
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 --resume > /dev/null 2>&1 || fail "--copies --resume"
+cmp copies/copies/2.ply 2.ply && diff -r copies/filtered filtered || fail "--resume: other bytes"
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --resume > /dev/null 2>&1
+diff -qr copies/filtered filtered > /dev/null && fail "the copy changes nothing"
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --restart > /dev/null 2>&1
+[ ! -e copies/copies/2.ply ] || fail "a copy of another run stays"
+"$gsfix" render fix1/splats.ply --with next/splats.ply --scene "$scene" --views 3 --restorer mini --out both > /dev/null 2>&1
+[ "$(ls both/*.png | wc -l)" = "$(ls plain/*.png | wc -l)" ] || fail "--with: not all views are rendered"
+cmp -s both/frame_001.png clean/frame_001.png && fail "--with changes nothing"
+
 for wrong in "fix $scene --out x --restorer mini:" "fix $scene --out x --filtered" \
+    "fix $scene --out x --restorer mini --copies 2" "render fix1/splats.ply --scene $scene --out x --with fix1/splats.ply" \
     "fix $scene --out x --restorer mini --fixed-exposure" "render fix1/splats.ply --scene $scene --out x --fixed-exposure" \
     "render fix1/splats.ply --path p.json --out x --restorer mini" "render fix1/splats.ply --scene $scene --out x --restorer dit:x"; do
     status=0
