@@ -755,11 +755,16 @@ static void tint_end(void* user, gsf_context* ctx) {
 
 // Views of several fixers: the mean of what the restorer makes of each one's renders, and the less of it the more this differs
 // beyond the renders.
-static void test_copies(gsf_context* ctx) {
+static void test_copies(void) {
     static repair r;
     static float color[2][3 * PIXELS], mean[2][3 * PIXELS], confidence[2][PIXELS], render[2][3 * PIXELS];
     tinter tint = {{0.0f, 0.0f}, 0, 0};
     gsf_fixer *twins[2], *others[2], *plain, *wrong[2];
+    gsf_context own, *ctx = &own;
+    counter memory = {0};
+    memset(&own, 0, sizeof own);
+    count_memory(ctx, &memory);
+    CHECK_OK(ctx, gsf_init_context(ctx));
     repair_setup(ctx, &r);
     gsf_restorer restorer = r.restorer;
     restorer.user = &tint;
@@ -807,6 +812,17 @@ static void test_copies(gsf_context* ctx) {
                 CHECK_NEAR(confidence[i][k / 3], middle, 1e-6);
             }
     }
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    size_t failures = 0;
+    memcpy(color, mean, sizeof color);
+    memset(mean, 0, sizeof mean);
+    for (; result == GSF_ERROR_OUT_OF_MEMORY && failures < 1000; failures++) {
+        tint.calls = 0;
+        memory.fail_at = memory.calls + 1 + failures;
+        result = gsf_splat_restore_views(ctx, twins, 2, cameras, 2, means, confidences);
+        memory.fail_at = 0;
+    }
+    CHECK(result == GSF_OK && failures > 10 && memcmp(color, mean, sizeof color) == 0);
     CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, twins, 0, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, wrong, 2, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(!tint.open);
@@ -814,6 +830,7 @@ static void test_copies(gsf_context* ctx) {
     gsf_splat_destroy_fixer(ctx, others[1]);
     gsf_splat_destroy_fixer(ctx, plain);
     repair_teardown(ctx, &r);
+    CHECK(memory.live == 0);
 }
 
 // Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
@@ -1319,7 +1336,7 @@ int main(void) {
     test_explaining_restorer(&ctx);
     test_loop(&ctx);
     test_restore_views(&ctx);
-    test_copies(&ctx);
+    test_copies();
     test_rigs(&ctx);
     test_given_path(&ctx);
     test_native_frames(&ctx);
