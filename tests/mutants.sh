@@ -16,6 +16,7 @@ gsfixer.h|test_gsfixer|JSON escapes of control characters are short|s/\\\\u%04x/
 gsfixer.h|test_resize|bicubic with a = -0.75, as OpenCV has it|s/const double a = -0\.5;/const double a = -0.75;/
 gsfixer.h|golden_metrics|SSIM: constants without their squares|s/c1 = gsf__vd_set\(0\.01 \* 0\.01\), c2 = gsf__vd_set\(0\.03 \* 0\.03\)/c1 = gsf__vd_set(0.01), c2 = gsf__vd_set(0.03)/
 gsfixer_nn.h|test_nn_vae|Winograd: a sign of the lower outputs|s/GSF_X\(3, \(u1 - u2\) - u3\)/GSF_X(3, (u1 - u2) + u3)/
+gsfixer_nn.h|test_nn_training|gradient of attention in bf16: dk is that of dy|s/b->packed, keys, q_across/b->packed, keys, dy_across/
 gsfixer_nn.h|test_nn_gradients|gradients: Winograd's weights, a sign|s/\(p\) - \(q\), left\);/(p) + (q), left);/
 gsfixer_nn.h|golden_metrics|LPIPS: features are not rectified|s/return gsf__v_max\(gsf__v_set\(0\.0f\), x\); \} \/\/ a NaN remains/return x; }/
 gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = gsf__sin_f64\(angle \* \(1\.0 - t\)\) \/ gsf__sin_f64\(angle\);/wa = 1.0 - t;/
@@ -48,6 +49,8 @@ gsfixer_splat.h|test_scene|undistortion: tangential terms swapped|s/\*u = x \* s
 gsfixer_nn.h|golden_restorer|RoPE: frequencies of the next pair|s/exponent = \(float\)k \/ \(float\)dim/exponent = (float)(k + 2) \/ (float)dim/
 gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s/m \+ 4 \* d, m \+ 3 \* d/m + d, m/
 gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
+gsfixer_splat.h|test_fixer|copies: what differs is not taken back|s/kept < 1\.0f \? kept : 1\.0f/1.0f/
+gsfixer_splat.h|test_fixer|copies: the variance is divided by their number|s/3\.0f \* \(float\)\(copies - 1\)/3.0f * (float)copies/
 gsfixer_splat.h|test_fixer|frames of warp are mixed in whatever their confidence|s/weight \* gsf__get_pixel\(f->warped_confidence \+ i, x, y, 0\)/weight/
 gsfixer_nn.h|test_nn_mini|mini: guesses are trained on where no photo shows anything|s/const int known = gsf__mini_shows\(shown, r->desc\.references, plane\)/const int known = 1/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
