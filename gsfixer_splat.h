@@ -15125,7 +15125,10 @@ GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* f
     if (result != GSF_OK)
         return gsf_fail(ctx, result, "restore: %zu views by %zu fixers, or one without a restorer or within a round", count,
                         fixer_count);
-    const size_t size = (size_t)color->width * (size_t)color->height; // of a view; only copies need all views to have it
+    for (size_t i = 0; i < count && fixer_count > 1; i++)
+        if (cameras[i].width != color->width || cameras[i].height != color->height)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "restore: view %zu has another size than the first image", i);
+    const size_t size = (size_t)color->width * (size_t)color->height;
     gsf_image* images = (gsf_image*)gsf_alloc_zeroed(ctx, count, 3 * sizeof *images);
     int32_t* known = (int32_t*)gsf_alloc(ctx, count, sizeof *known);
     gsf__copies_pixel* pixels = NULL;

@@ -825,6 +825,9 @@ static void test_copies(void) {
     CHECK(result == GSF_OK && failures > 10 && memcmp(color, mean, sizeof color) == 0);
     CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, twins, 0, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, wrong, 2, cameras, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_camera sizes[2] = {cameras[0], cameras[1]};
+    sizes[1].height++;
+    CHECK_RESULT(ctx, gsf_splat_restore_views(ctx, twins, 2, sizes, 2, means, confidences), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(!tint.open);
     for (int i = 0; i < 2; i++) gsf_splat_destroy_fixer(ctx, twins[i]);
     gsf_splat_destroy_fixer(ctx, others[1]);
