@@ -628,6 +628,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_resto
    the host steps, so it can show, cancel, checkpoint or stop at any time.
        gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
+typedef struct gsf_fixer gsf_fixer;
+
 typedef struct gsf_fix_desc {
     uint32_t _start_canary;
     gsf_train_desc train;         // for the whole run; train.iterations is the total number of steps
@@ -661,6 +663,8 @@ typedef struct gsf_fix_desc {
     float auto_exposure;          // share of the exposure that the photos' camera would have chosen for a frame of
                                   // gsf_splat_restore_views, if the photos show that it chose by what it saw and the restorer
                                   // has photos carried; default 1; negative = 0: frames keep the exposure of the splats
+    gsf_fixer* const* copies;     // (copy_count) trained fixers of the same views, with other seeds, to be joined; borrowed
+    size_t copy_count;            // until the fixer is destroyed. See gsf_splat_make_fixer
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -680,11 +684,13 @@ typedef struct gsf_fix_stats { // what the last step did
     const int32_t* reference_index;   // per frame: the training view with the same pose, or -1
 } gsf_fix_stats;
 
-typedef struct gsf_fixer gsf_fixer;
-
 // Views and splats are copied; the restorer (NULL: plain training) is borrowed until the fixer is destroyed.
 // The path of every round is sampled once: cameras that admit no path give GSF_ERROR_DEGENERATE before any
 // training.
+// With desc->copies, which err differently and so less together, the fixer joins them. It starts from all their splats, each so
+// transparent that one of every copy are as opaque as one was (initial: NULL), and trains as the desc of one copy says, but for
+// an eighth of its iterations, with slower means, no growth and no dropout. Its only round comes after the first step: the
+// frames are what gsf_splat_restore_views makes of the copies; no window is skipped and `warp` not mixed in.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc,
                                                       const gsf_train_view* views, size_t view_count,
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
@@ -14461,6 +14467,23 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     return d;
 }
 
+static gsf_fix_desc gsf__joining_desc(const gsf_fix_desc* copy) { // what joins copies that were trained by this desc
+    gsf_fix_desc d = *copy;
+    const int32_t iterations = d.train.iterations ? d.train.iterations : 30000;
+    d.train.iterations = iterations < 8 ? 1 : iterations / 8;
+    d.train.lr_means = 0.2f * gsf__or_zero(d.train.lr_means, 1.6e-4f);
+    if (d.train.lr_means == 0.0f) d.train.lr_means = -1.0f;
+    d.train.densify_until = -1;
+    d.train.mcmc = 0;
+    d.train.coarse_until = 0;
+    d.train.dropout = 0.0f;
+    if (d.rounds >= 0) d.rounds = 1;
+    d.first_round = d.last_round = 1;
+    d.skip_psnr = 0.0f;
+    d.warp_weight = -1.0f;
+    return d;
+}
+
 static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, const gsf_restorer* restorer) {
     if (d->first_round < 0 || d->first_round > d->train.iterations || d->last_round > d->train.iterations)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid rounds %d..%d of %d iterations",
@@ -14477,6 +14500,15 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (!(d->auto_exposure >= 0.0f && d->auto_exposure <= 1.0f) || !(d->warp_weight >= 0.0f && d->warp_weight <= 1e6f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid auto_exposure %g or warp_weight %g",
                         (double)d->auto_exposure, (double)d->warp_weight);
+    if (d->copy_count && !d->copies) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: no copies");
+    for (size_t k = 0; k < d->copy_count; k++) {
+        const gsf_splats* splats = gsf_splat_get_trained(d->copies[k]->trainer);
+        const gsf_splats* first = gsf_splat_get_trained(d->copies[0]->trainer);
+        const int restorable = d->rounds < 1 || d->copies[k]->desc.rounds > 0;
+        if (splats->sh_degree != first->sh_degree || d->copies[k]->restoring || !restorable)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                            "fix: copy %zu is within a round, or without a restorer or the SH degree of the first one", k);
+    }
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
@@ -14593,6 +14625,35 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) { // of round
 
 static int gsf__carries(const gsf_fixer* f) { return f->limits.needs_carried > 0 || f->explain.user != NULL; }
 
+/* The union of the copies' splats. Where all have the same surface, the centres of n splats of opacity 1 - (1 - o)^(1/n) let as
+   much light through as that of one of opacity o; a splat that one copy has and no other fades by about n. */
+static gsf_result gsf__join_copies(gsf_context* ctx, const gsf_fix_desc* d, gsf_splats* out) {
+    const gsf_splats* first = gsf_splat_get_trained(d->copies[0]->trainer);
+    size_t count = 0;
+    for (size_t k = 0; k < d->copy_count; k++) count += gsf_splat_get_trained(d->copies[k]->trainer)->count;
+    GSF__TRY(gsf_splat_make(ctx, count, first->sh_degree, out));
+    memcpy(out->background, first->background, sizeof out->background);
+    memcpy(out->origin, first->origin, sizeof out->origin);
+    out->antialiased = first->antialiased;
+    size_t at = 0;
+    for (size_t k = 0; k < d->copy_count; k++) {
+        const gsf_splats* copy = gsf_splat_get_trained(d->copies[k]->trainer);
+        gsf__column from[GSF__SPLAT_COLUMNS], to[GSF__SPLAT_COLUMNS];
+        gsf__splat_columns(copy, from);
+        gsf__splat_columns(out, to);
+        for (int c = 0; c + 1 < GSF__SPLAT_COLUMNS; c++) // but the ids
+            memcpy(to[c].data + at * to[c].row, from[c].data, copy->count * from[c].row);
+        for (size_t i = at; i < at + copy->count; i++) {
+            const double thickness = gsf__log1p_f64(gsf__exp_f64((double)out->opacity_logits[i])); // -log(1 - opacity)
+            out->opacity_logits[i] = (float)gsf__log_f64(gsf__expm1_f64(thickness / (double)d->copy_count));
+            for (size_t c = 0; c < 3; c++)
+                out->means[3 * i + c] = (float)((double)out->means[3 * i + c] + (copy->origin[c] - out->origin[c]));
+        }
+        at += copy->count;
+    }
+    return GSF_OK;
+}
+
 static gsf_result gsf__keep_points(gsf_context* ctx, gsf_fixer* f, const gsf_splats* initial) {
     f->points = (double*)gsf_alloc(ctx, initial->count + 1, 3 * sizeof *f->points);
     if (!f->points) return GSF_ERROR_OUT_OF_MEMORY;
@@ -14619,13 +14680,19 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     if (!desc) desc = &zero;
     GSF__CHECK_CANARIES(ctx, "fix", desc);
     GSF__TRY(gsf__check_train_canaries(ctx, &desc->train));
+    gsf_fix_desc joining;
+    if (desc->copy_count > 0) joining = gsf__joining_desc(desc), desc = &joining;
     const gsf_fix_desc resolved = gsf__fix_desc_defaults(desc, view_count, restorer != NULL);
     GSF__TRY(gsf__check_fix_desc(ctx, &resolved, restorer));
     gsf_fixer* f = (gsf_fixer*)gsf_alloc_zeroed(ctx, 1, sizeof *f);
     if (!f) return GSF_ERROR_OUT_OF_MEMORY;
     f->desc = resolved;
     f->restorer = restorer;
-    gsf_result result = gsf_splat_make_trainer(ctx, &f->desc.train, views, view_count, initial, &f->trainer);
+    gsf_splats joined;
+    memset(&joined, 0, sizeof joined);
+    gsf_result result = f->desc.copy_count ? gsf__join_copies(ctx, &f->desc, &joined) : GSF_OK;
+    if (f->desc.copy_count) initial = &joined;
+    if (result == GSF_OK) result = gsf_splat_make_trainer(ctx, &f->desc.train, views, view_count, initial, &f->trainer);
     if (result != GSF_OK) goto cleanup;
     f->cameras = (gsf_camera*)gsf_alloc(ctx, view_count, sizeof(gsf_camera));
     if (!f->cameras) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -14647,6 +14714,7 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
         result = gsf_splat_make_warp(ctx, &f->explain);
     if (result == GSF_OK && gsf__carries(f)) result = gsf__keep_points(ctx, f, initial);
 cleanup:
+    gsf_splat_destroy(ctx, &joined);
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
     else *out = f;
     return result;
@@ -14835,6 +14903,9 @@ static void gsf__mix_warped(const gsf_fixer* f, const gsf_restore_window* window
 static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, const gsf_restore_window* window, int* skip) {
     const int mixed = f->desc.warp_weight > 0.0f;
     *skip = 0;
+    if (f->desc.copy_count > 0)
+        return gsf_splat_restore_views(ctx, f->desc.copies, f->desc.copy_count, window->cameras, (size_t)window->frame_count,
+                                       window->out_color, window->out_confidence);
     if (f->desc.skip_psnr > 0.0f || mixed) {
         const gsf_restorer* explain = f->limits.explains ? f->restorer : &f->explain;
         gsf_restore_window shared = *window; // the internal warp uses the loop's carrier, whatever the restorer asks for
@@ -14956,7 +15027,7 @@ static void gsf__lend_carrier(gsf_fixer* f, gsf_restore_window* window, const gs
 static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
     const size_t begin = (size_t)f->window * (size_t)f->frames;
     int skip;
-    GSF__TRY(gsf__open_references(ctx, f));
+    if (!f->desc.copy_count) GSF__TRY(gsf__open_references(ctx, f));
     gsf_restore_window window;
     memset(&window, 0, sizeof window);
     window.struct_size = sizeof window;

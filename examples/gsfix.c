@@ -75,8 +75,8 @@ static const option_spec option_specs[] = {
     {"--filtered", FLAG, AT(filtered), 0, 0, NULL, "fix",
      "have the restorer clean up the final renders of the held-out views, too: filtered/, and figures of their own"},
     {"--copies", WHOLE, AT(copies), 1, 16, "N", "fix",
-     "--filtered: train N - 1 copies more, with the seeds that follow, copies/2.ply and so on, and make filtered/ from all of\n"
-     "them, as they err differently (default 1)"},
+     "train N - 1 times more, with the seeds that follow, and join the copies, copies/1.ply to N.ply, which err differently and\n"
+     "so less together; takes about N times as long (default 1)"},
     {"--with", TEXT, AT(with), 0, 0, "FILE,...", "render",
      "--restorer: splats of the same photos trained with other seeds; the frames are made from all of them"},
     {"--fixed-exposure", FLAG, AT(fixed_exposure), 0, 0, NULL, "fix render",

@@ -311,7 +311,7 @@ enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFI
        GSFIX_COPIES, GSFIX_STAGES };
 extern const char* const gsfix_stage_names[GSFIX_STAGES];
 
-enum { GSFIX_COPIES_MOST = 16 }; // with the run itself, see --copies
+enum { GSFIX_COPIES_MOST = 16 }; // the run itself included, see --copies
 
 typedef struct gsfix_history { // record of the run, stored in the checkpoint next to the fixer's state
     double seconds[GSFIX_STAGES], seconds_total;
@@ -337,7 +337,8 @@ typedef struct gsfix_result { // results of a finished run, for metrics.json and
     gsfix_score mean, without, filtered;
     const gsfix_score* views; // one per test view
     const gsfix_score* filtered_views; // likewise, of the renders that the restorer has cleaned up; NULL: --filtered not given
-    size_t copies;            // that these were made from, the run itself included
+    size_t copies;            // that were joined, the run itself included; 1: --copies not given
+    double first_copy;        // mean PSNR of the run itself
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;
     gsf_render_desc render;   // what the splats were trained with, the near plane included

@@ -192,7 +192,6 @@ int gsfix_resolve_setup(gsfix_app* app, gsfix_setup* setup) {
         return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     if (app->o.filtered && !has_restorer(app)) return gsfix_misused(app, "--filtered: needs a --restorer");
     if (app->o.fixed_exposure && !app->o.filtered) return gsfix_misused(app, "--fixed-exposure: needs --filtered");
-    if (app->o.copies > 1 && !app->o.filtered) return gsfix_misused(app, "--copies: needs --filtered");
     return gsfix_check_restorer(app);
 }
 
@@ -217,7 +216,7 @@ typedef struct fix_run {
     int comparing; // set during the run without repair, the first one of --compare
     const gsfix_fix_task* task; // of another command, or NULL
     gsf_fixer* fixer;
-    gsf_fixer* copies[GSFIX_COPIES_MOST]; // those of --copies, for the filtered views; the first one is `fixer`
+    gsf_fixer* copies[GSFIX_COPIES_MOST]; // those of --copies, once the run itself, the first of them, is done
     gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
@@ -232,7 +231,7 @@ typedef struct fix_run {
 
 static size_t copy_count(const fix_run* run) { return run->app->o.copies > 1 ? (size_t)run->app->o.copies : 1; }
 
-static gsfix_path copy_file(int copy) { return gsfix_pathf("copies/%d.ply", copy + 1); } // copy: from 1; 0 is the run itself
+static gsfix_path copy_file(int copy) { return gsfix_pathf("copies/%d.ply", copy + 1); } // 0: the run itself
 
 static void add_seconds(fix_run* run, int stage, double* since) {
     const double now = gsfix_now();
@@ -370,9 +369,12 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
     return result;
 }
 
-// Has the restorer clean up the renders of all held-out views, of all copies, and scores them.
+// Has the restorer clean up the renders of all held-out views, and those of the copies, and scores them.
 static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
     gsf_context* ctx = run->ctx;
+    gsf_fixer* fixers[GSFIX_COPIES_MOST + 1] = {run->fixer};
+    size_t count = 1;
+    for (size_t i = 0; i < GSFIX_COPIES_MOST && run->copies[i]; i++) fixers[count++] = run->copies[i];
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
         const gsf_camera* camera = &run->scene.views[run->split.test[i]].camera;
@@ -381,7 +383,7 @@ static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
         result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &color);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &confidence);
         if (result == GSF_OK)
-            result = gsf_splat_restore_views(ctx, run->copies, copy_count(run), camera, 1, &color, &confidence);
+            result = gsf_splat_restore_views(ctx, fixers, count, camera, 1, &color, &confidence);
         if (result == GSF_OK) gsfix_clamp(&color);
         if (result == GSF_OK) result = score_view(run, i, &color, 1, scores + i);
         if (result == GSF_OK)
@@ -790,28 +792,33 @@ static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, s
     return result;
 }
 
-// Replaces the fixer by a new one, with the restorer unless this is the run without repair.
-static gsf_result make_fixer(fix_run* run, const gsf_splats* initial, int copy, const gsf_restorer* restorer, gsf_fixer** out) {
-    gsf_context* ctx = run->ctx;
-    const size_t n = run->split.train_count;
-    gsf_train_view* views = NULL;
-    gsf_result result = gsf_splat_load_train_views(ctx, &run->scene, run->split.train, n, &views);
-    if (result != GSF_OK) return result;
+static gsf_fix_desc fixer_desc(const fix_run* run, int copy) {
     gsf_fix_desc desc = run->setup.fix;
     desc.points = run->scene.points; // they determine the up direction of the path
     desc.point_count = run->scene.point_count;
     desc.path = run->path;
     desc.path_count = run->path_count;
     desc.train.seed += (uint64_t)copy;
-    result = gsf_splat_make_fixer(ctx, &desc, views, n, initial, restorer, out);
-    gsf_free(ctx, views);
+    return desc;
+}
+
+static gsf_result make_fixer(fix_run* run, const gsf_fix_desc* desc, const gsf_splats* initial, gsf_fixer** out) {
+    const size_t n = run->split.train_count;
+    gsf_train_view* views = NULL;
+    gsf_result result = gsf_splat_load_train_views(run->ctx, &run->scene, run->split.train, n, &views);
+    if (result != GSF_OK) return result;
+    const int repairs = run->has_restorer && !run->comparing;
+    result = gsf_splat_make_fixer(run->ctx, desc, views, n, initial, repairs ? &run->restorer : NULL, out);
+    gsf_free(run->ctx, views);
     return result;
 }
 
+// Replaces the fixer by a new one.
 static gsf_result start_fixer(fix_run* run) {
+    const gsf_fix_desc desc = fixer_desc(run, 0);
     gsf_splat_destroy_fixer(run->ctx, run->fixer);
     run->fixer = NULL;
-    return make_fixer(run, &run->initial, 0, run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
+    return make_fixer(run, &desc, &run->initial, &run->fixer);
 }
 
 static gsf_result resume(fix_run* run) {
@@ -887,7 +894,7 @@ static gsf_result open_fix_out(fix_run* run) {
         if (result == GSF_OK && app->o.compare) result = gsfix_claim(app, "report/without/%s.png", stem.s);
         if (result == GSF_OK && app->o.filtered) result = gsfix_claim(app, "filtered/%s.png", stem.s);
     }
-    for (int i = 1; i < app->o.copies && result == GSF_OK; i++) result = gsfix_claim(app, "%s", copy_file(i).s);
+    for (int i = 0; i < app->o.copies && result == GSF_OK; i++) result = gsfix_claim(app, "%s", copy_file(i).s);
     for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app) && !run->task; i++)
         result = gsfix_claim(app, "%s", repair[i]);
     if (result == GSF_OK && run->task) result = run->task->claim_fn(app, run->task->user);
@@ -937,7 +944,7 @@ static gsf_result prepare(fix_run* run) {
     run->comparing = app->o.compare;
     if (run->resuming) result = resume(run);
     else result = gsfix_remove_output(app, "checkpoint");
-    for (int i = 1; i < app->o.copies && result == GSF_OK && !run->resuming; i++)
+    for (int i = 0; i < app->o.copies && result == GSF_OK && !run->resuming; i++)
         result = gsfix_remove_output(app, copy_file(i).s); // of another run
     if (result == GSF_OK && !run->resuming && run->comparing) result = start_fixer(run);
     if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
@@ -1042,8 +1049,14 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
     return result;
 }
 
-static double all_steps(const fix_run* run) { // of the run without repair, the run itself and its copies
-    return (double)run->iterations * ((run->app->o.compare ? 1.0 : 0.0) + (double)copy_count(run));
+// Steps before the one that trains a copy begins, the number of copies for what joins them.
+static double steps_before(const fix_run* run, int copy) {
+    return (double)run->iterations * ((run->app->o.compare ? 1.0 : 0.0) + copy);
+}
+
+static double all_steps(const fix_run* run) {
+    const int copies = (int)copy_count(run);
+    return steps_before(run, copies) + (copies > 1 ? floor(run->iterations / 8.0) : 0.0); // joining them takes an eighth
 }
 
 static void show_step(fix_run* run, const gsf_fix_stats* stats) {
@@ -1122,52 +1135,69 @@ static gsf_result run_trainings(fix_run* run) {
 
 // ---- copies ----------------------------------------------------------------------
 
-// Trains a copy as a run with its seed would, and saves its splats.
-static gsf_result train_copy(fix_run* run, int copy) {
+static gsf_result save_copy(fix_run* run, int copy, const gsf_fixer* fixer) {
+    gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(fixer));
+    view.antialiased = run->setup.fix.train.render.antialiased;
+    return gsf_splat_save(run->ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(copy).s).s, &view, NULL);
+}
+
+// Trains a copy to its end, or what joins them.
+static gsf_result train_copy(fix_run* run, gsf_fixer* fixer, int copy, const char* name) {
     gsf_context* ctx = run->ctx;
-    const int count = (int)copy_count(run);
+    gsf_result result = GSF_OK;
+    while (result == GSF_OK) {
+        gsf_fix_stats stats;
+        result = gsf_splat_step_fixer(ctx, fixer, &stats);
+        if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
+        if (stats.stage == GSF_FIX_TRAIN)
+            gsfix_progress(run->app, steps_before(run, copy) + stats.train.iteration, all_steps(run),
+                           "%s: step %d  loss %.4f  %zu splats", name, (int)stats.train.iteration, stats.train.loss,
+                           stats.train.splats);
+    }
+    if (result == GSF_ERROR_CANCELLED)
+        result = gsf_fail(ctx, result, "stopped in %s; --resume goes on from %s/checkpoint", name, run->app->o.out);
+    return result;
+}
+
+// Trains a copy as a run with its seed would, and saves its splats.
+static gsf_result make_copy(fix_run* run, int copy) {
+    gsf_context* ctx = run->ctx;
+    const gsf_fix_desc desc = fixer_desc(run, copy);
+    const gsfix_path name = gsfix_pathf("copy %d of %d", copy + 1, (int)copy_count(run));
     gsf_initial_desc start = run->setup.initial;
     gsf_splats initial = {0};
     gsf_fixer* fixer = NULL;
     start.seed += (uint64_t)copy;
     gsf_result result = gsf_splat_make_initial_splats(ctx, &run->scene, run->split.train, run->split.train_count, &start,
                                                       &initial, NULL);
-    if (result == GSF_OK) result = make_fixer(run, &initial, copy, &run->restorer, &fixer);
+    if (result == GSF_OK) result = make_fixer(run, &desc, &initial, &fixer);
     gsf_splat_destroy(ctx, &initial);
-    while (result == GSF_OK) {
-        gsf_fix_stats stats;
-        result = gsf_splat_step_fixer(ctx, fixer, &stats);
-        if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
-        if (stats.stage == GSF_FIX_TRAIN)
-            gsfix_progress(run->app, all_steps(run) - (double)run->iterations * (count - copy) + stats.train.iteration,
-                           all_steps(run), "copy %d of %d: step %d of %d  loss %.4f  %zu splats", copy + 1, count,
-                           (int)stats.train.iteration, (int)run->iterations, stats.train.loss, stats.train.splats);
-    }
-    if (result == GSF_OK) {
-        gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(fixer));
-        view.antialiased = run->setup.fix.train.render.antialiased;
-        result = gsf_splat_save(ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(copy).s).s, &view, NULL);
-    }
-    if (result == GSF_ERROR_CANCELLED)
-        result = gsf_fail(ctx, result, "stopped in copy %d of %d; --resume goes on from %s/checkpoint", copy + 1, count,
-                          run->app->o.out);
+    if (result == GSF_OK) result = train_copy(run, fixer, copy, name.s);
+    if (result == GSF_OK) result = save_copy(run, copy, fixer);
     gsf_splat_destroy_fixer(ctx, fixer);
     return result;
 }
 
-// Those that an interrupted run has left are not trained again.
-static gsf_result make_copies(fix_run* run) {
+// Makes the copies, but those that an interrupted run has left, and joins them to the run's splats.
+static gsf_result join_copies(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_result result = GSF_OK;
+    const int count = (int)copy_count(run);
+    gsf_result result = save_copy(run, 0, run->fixer);
     run->copies[0] = run->fixer;
-    for (int i = 1; i < (int)copy_count(run) && result == GSF_OK; i++) {
+    run->fixer = NULL;
+    for (int i = 1; i < count && result == GSF_OK; i++) {
+        const gsf_fix_desc desc = fixer_desc(run, i);
         gsf_splats splats = {0};
-        if (!gsfix_has_output(run->app, copy_file(i).s)) result = train_copy(run, i);
+        if (!gsfix_has_output(run->app, copy_file(i).s)) result = make_copy(run, i);
         if (result == GSF_OK) result = gsf_splat_load(ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(i).s).s, &splats);
-        if (result == GSF_OK) result = make_fixer(run, &splats, i, &run->restorer, &run->copies[i]);
+        if (result == GSF_OK) result = make_fixer(run, &desc, &splats, &run->copies[i]);
         gsf_splat_destroy(ctx, &splats);
     }
-    return result;
+    gsf_fix_desc desc = fixer_desc(run, 0);
+    desc.copies = run->copies;
+    desc.copy_count = (size_t)count;
+    if (result == GSF_OK) result = make_fixer(run, &desc, NULL, &run->fixer);
+    return result == GSF_OK ? train_copy(run, run->fixer, count, "joining the copies") : result;
 }
 
 // ---- results ---------------------------------------------------------------------
@@ -1245,10 +1275,13 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_text(ctx, t, "scene", run->scene.folder);
     write_scores(ctx, t, "", &r->mean);
     if (h->has_without) write_scores(ctx, t, "_without_repair", &r->without);
+    if (r->copies > 1) {
+        gsfix_json_number(ctx, t, "copies", (double)r->copies);
+        gsfix_json_number(ctx, t, "psnr_first_copy", r->first_copy);
+    }
     if (r->filtered_views) {
         gsfix_json_begin(ctx, t, "filtered", '{');
         write_scores(ctx, t, "", &r->filtered);
-        gsfix_json_number(ctx, t, "copies", (double)r->copies);
         gsfix_json_end(ctx, t, '}');
     }
     gsfix_json_text(ctx, t, "measured",
@@ -1292,6 +1325,7 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     gsfix_app* app = run->app;
     const gsfix_history* h = &run->history;
     const size_t missing = run->scene.missing_count;
+    const double alone = r->copies > 1 ? r->first_copy : r->mean.psnr;
     if (missing)
         gsfix_print(app, "missing    %zu of %zu photos, so that views and held-out split differ from the complete scene",
                     missing, missing + run->scene.view_count);
@@ -1299,10 +1333,11 @@ static void print_results(fix_run* run, const gsfix_result* r) {
         gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim,
                     run->split.test_count);
         if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
+        if (r->copies > 1)
+            gsfix_print(app, "one copy   PSNR %.3f dB  (the first of %zu, before they were joined)", r->first_copy, r->copies);
         if (h->has_without)
-            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair alone: %+.3f dB)",
-                        r->without.psnr,
-                        r->without.ssim, r->mean.psnr - r->without.psnr);
+            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair%s alone: %+.3f dB)",
+                        r->without.psnr, r->without.ssim, r->copies > 1 ? " of one copy" : "", alone - r->without.psnr);
         if (r->filtered_views)
             gsfix_print(app, "filtered   PSNR %.3f dB  SSIM %.4f  (the same renders%s, cleaned up by the restorer)",
                         r->filtered.psnr, r->filtered.ssim, r->copies > 1 ? " and those of the copies" : "");
@@ -1378,19 +1413,24 @@ static gsf_result finish(fix_run* run) {
     r.masks = run->masks;
     r.views = views;
     r.iterations = run->iterations;
+    r.copies = copy_count(run);
+    r.first_copy = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
+    gsf_result result = r.copies > 1 ? join_copies(run) : GSF_OK;
+    add_seconds(run, GSFIX_COPIES, &clock);
+    if (result != GSF_OK) {
+        gsf_free(ctx, views);
+        return result;
+    }
     r.splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     r.render = run->setup.fix.train.render;
-    gsf_result result = run->task ? GSF_OK : save_splats(run, r.splats);
+    if (!run->task) result = save_splats(run, r.splats);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);
     r.mean = mean_score(views, tests);
     if (run->app->o.filtered && tests) {
-        if (result == GSF_OK) result = make_copies(run);
-        add_seconds(run, GSFIX_COPIES, &clock);
         if (result == GSF_OK) result = evaluate_filtered(run, views + tests);
         r.filtered_views = views + tests;
-        r.copies = copy_count(run);
         r.filtered = mean_score(views + tests, tests);
         add_seconds(run, GSFIX_RESTORE, &clock);
     }
@@ -1411,8 +1451,8 @@ static gsf_result finish(fix_run* run) {
 
 static void free_run(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    for (int i = 1; i < GSFIX_COPIES_MOST; i++) gsf_splat_destroy_fixer(ctx, run->copies[i]);
     gsf_splat_destroy_fixer(ctx, run->fixer);
+    for (int i = 0; i < GSFIX_COPIES_MOST; i++) gsf_splat_destroy_fixer(ctx, run->copies[i]);
     gsf_destroy_restorer(run->ctx, &run->restorer);
     gsf_splat_destroy(ctx, &run->initial);
     for (size_t i = 0; run->masks && i < run->split.test_count; i++) gsf_destroy_image(ctx, run->masks + i);

@@ -163,13 +163,15 @@ static gsf_result put_views(page* p) {
     gsfix_put_raw(p, "<section><h2>Held-out views</h2><p>Photos that were not used for training. Drag the divider in an image to compare.");
     if (r->history->has_without)
         gsfix_put(p, " <em>Without repair</em> is a second run from the same start and seed with the same number of steps (%d): the "
-               "difference, %+.2f dB on average, is what the repair alone contributes.",
-            (int)r->iterations, r->mean.psnr - r->without.psnr);
+               "difference, %+.2f dB on average, is what the repair%s contributes.",
+            (int)r->iterations, (r->copies > 1 ? r->first_copy : r->mean.psnr) - r->without.psnr,
+            r->copies > 1 ? " in one copy" : " alone");
+    if (r->copies > 1)
+        gsfix_put(p, " The splats join %zu copies, trained with different seeds: %+.2f dB over the first of them.", r->copies,
+               r->mean.psnr - r->first_copy);
     if (r->filtered_views) {
-        gsfix_put_raw(p, " <em>Filtered</em> are the same renders");
-        if (r->copies == 2) gsfix_put_raw(p, ", together with those of a copy trained with another seed,");
-        if (r->copies > 2) gsfix_put(p, ", together with those of %zu copies trained with other seeds,", r->copies - 1);
-        gsfix_put(p, " cleaned up by the restorer, %+.2f dB on average; the splats stay as they are.", r->filtered.psnr - r->mean.psnr);
+        gsfix_put(p, " <em>Filtered</em> are the same renders%s cleaned up by the restorer, %+.2f dB on average; the splats stay as they are.",
+            r->copies > 1 ? ", together with those of the copies," : "", r->filtered.psnr - r->mean.psnr);
     }
     gsfix_put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
     if (r->history->has_without)
@@ -327,6 +329,7 @@ static void put_curve(page* p) {
     f.sy = (BOTTOM - TOP) / (high - low);
     f.y0 = BOTTOM + f.sy * low;
     gsfix_put_raw(p, "<section><h2>PSNR over the steps</h2><p>Mean over the held-out views, measured while training");
+    if (p->r->copies > 1) gsfix_put_raw(p, " the first copy");
     if (h->round_count) gsfix_put_raw(p, "; vertical lines mark repair rounds");
     gsfix_put_raw(p, ".</p>\n<svg class=chart viewBox=\"0 0 720 290\" role=img aria-label=\"PSNR over training steps\">");
     for (double y = low; y <= high + 0.01 * step; y += step)
@@ -360,7 +363,7 @@ static void put_seconds(page* p) {
                                                    "rendering and measuring held-out views", "rendering and repairing path frames",
                                                    "training with repaired frames", "writing checkpoints for --resume",
                                                    "writing images and splats", "run without repair, for comparison",
-                                                   "copies with other seeds, for the filtered views"};
+                                                   "copies with other seeds, and joining them"};
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];

@@ -51,6 +51,9 @@ gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s
 gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
 gsfixer_splat.h|test_fixer|copies: what differs is not taken back|s/kept < 1\.0f \? kept : 1\.0f/1.0f/
 gsfixer_splat.h|test_fixer|copies: the variance is divided by their number|s/3\.0f \* \(float\)\(copies - 1\)/3.0f * (float)copies/
+gsfixer_splat.h|test_fixer|joined copies: each keeps its opacity|s/thickness \/ \(double\)d->copy_count/thickness/
+gsfixer_splat.h|test_fixer|joined copies: frames of their own splats|s/if \(f->desc\.copy_count > 0\)/if (0)/
+gsfixer_splat.h|test_fixer|joined copies: dropout goes on|s/d\.train\.dropout = 0\.0f;/;/
 gsfixer_splat.h|test_fixer|frames of warp are mixed in whatever their confidence|s/weight \* gsf__get_pixel\(f->warped_confidence \+ i, x, y, 0\)/weight/
 gsfixer_nn.h|test_nn_mini|mini: guesses are trained on where no photo shows anything|s/const int known = gsf__mini_shows\(shown, r->desc\.references, plane\)/const int known = 1/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/

@@ -836,6 +836,111 @@ static void test_copies(void) {
     CHECK(memory.live == 0);
 }
 
+// Copies joined: all their splats, together as opaque as those of one copy; a round of what the restorer makes of the copies;
+// no growth.
+static void test_joined(void) {
+    static repair r;
+    static float made[16][3 * PIXELS], confidence[16][PIXELS];
+    tinter tint = {{0.02f, 0.06f}, 0, 0};
+    gsf_fixer *copies[2], *other, *plain, *joined, *again;
+    gsf_context own, *ctx = &own;
+    counter memory = {0};
+    memset(&own, 0, sizeof own);
+    count_memory(ctx, &memory);
+    CHECK_OK(ctx, gsf_init_context(ctx));
+    repair_setup(ctx, &r);
+    gsf_restorer restorer = r.restorer;
+    restorer.user = &tint;
+    restorer.query_fn = tint_query;
+    restorer.begin_fn = tint_begin;
+    restorer.restore_fn = tint_restore;
+    restorer.end_fn = tint_end;
+    gsf_fix_desc desc = repair_desc();
+    for (int i = 0; i < 2; i++)
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.truth, &restorer, &copies[i]));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, NULL, &plain));
+    gsf_splats linear;
+    CHECK_OK(ctx, gsf_splat_make(ctx, TRUTH, 1, &linear));
+    for (size_t i = 0; i < TRUTH; i++) linear.quats[4 * i] = 1.0f;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &linear, &restorer, &other));
+
+    desc.train.dropout = 0.5f;
+    desc.copies = copies;
+    desc.copy_count = 2;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &joined));
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &again));
+    const gsf_fix_desc used = gsf_splat_get_fixer_desc(joined);
+    CHECK(used.train.iterations == 15 && used.rounds == 1 && used.first_round == 1 && used.train.dropout == 0.0f);
+    const gsf_splats* all = gsf_splat_get_trained(gsf_splat_get_trainer(joined));
+    CHECK(all->count == 2 * TRUTH);
+    for (size_t i = 0; i < 2 * TRUTH; i++) {
+        const double passed = 1.0 / (1.0 + exp((double)all->opacity_logits[i]));
+        CHECK_NEAR(passed * passed, 1.0 / (1.0 + exp((double)r.truth.opacity_logits[i % TRUTH])), 1e-6);
+        CHECK(memcmp(all->means + 3 * i, r.truth.means + 3 * (i % TRUTH), 12) == 0);
+        CHECK(memcmp(all->sh + 3 * i, r.truth.sh + 3 * (i % TRUTH), 12) == 0);
+    }
+
+    int stages[4] = {0}, windows = 0;
+    gsf_fix_stats stats;
+    gsf_buffer chunks = {0};
+    do {
+        if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, joined, &stats))) break;
+        stages[stats.stage]++;
+        if (stats.stage == GSF_FIX_TRAIN && stats.train.iteration == 9) {
+            gsf_splat_format_fixer(ctx, joined, &chunks);
+            gsf_append_last_chunk(ctx, &chunks);
+        }
+        if (stats.stage != GSF_FIX_RESTORE) continue;
+        gsf_image colors[16], confidences[16];
+        CHECK(stages[GSF_FIX_TRAIN] == 1 && stats.restored != NULL && stats.frame_count <= 16);
+        for (int32_t i = 0; i < stats.frame_count; i++) {
+            const gsf_camera* c = stats.cameras + i;
+            colors[i] = gsf_wrap_image(made[i], GSF_F32, c->width, c->height, 3);
+            confidences[i] = gsf_wrap_image(confidence[i], GSF_F32, c->width, c->height, 1);
+        }
+        CHECK_OK(ctx, gsf_splat_restore_views(ctx, copies, 2, stats.cameras, (size_t)stats.frame_count, colors, confidences));
+        for (int32_t i = 0; i < stats.frame_count; i++)
+            CHECK(memcmp(made[i], stats.restored[i].data, sizeof made[i]) == 0);
+        windows++;
+    } while (stats.stage != GSF_FIX_DONE);
+    CHECK(stages[GSF_FIX_TRAIN] == 15 && windows == 2 && all->count == 2 * TRUTH && !tint.open);
+    CHECK_OK(ctx, gsf_splat_parse_fixer(ctx, again, "joined", chunks.data, chunks.size));
+    while (!run_steps(ctx, again, 1, NULL)) continue;
+    CHECK(same_splats(again, joined));
+    gsf_destroy_buffer(ctx, &chunks);
+    gsf_splat_destroy_fixer(ctx, again);
+
+    desc.copy_count = 1; // without a restorer, copies may have none either
+    desc.copies = &plain;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, NULL, &again));
+    CHECK(gsf_splat_get_fixer_desc(again).rounds == 0 && run_steps(ctx, again, 16, NULL));
+    gsf_splat_destroy_fixer(ctx, again);
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &again), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_fixer* const unlike[2] = {copies[0], other};
+    desc.copies = unlike;
+    desc.copy_count = 2;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &again), GSF_ERROR_INVALID_ARGUMENT);
+    desc.copies = NULL;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &again), GSF_ERROR_INVALID_ARGUMENT);
+    desc.copies = copies;
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    size_t failures = 0;
+    for (; result == GSF_ERROR_OUT_OF_MEMORY && failures < 1000; failures++) {
+        memory.fail_at = memory.calls + 1 + failures;
+        result = gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, NULL, &restorer, &again);
+        memory.fail_at = 0;
+    }
+    CHECK(result == GSF_OK && failures > 10);
+    gsf_splat_destroy_fixer(ctx, again);
+    gsf_splat_destroy_fixer(ctx, joined);
+    for (int i = 0; i < 2; i++) gsf_splat_destroy_fixer(ctx, copies[i]);
+    gsf_splat_destroy_fixer(ctx, other);
+    gsf_splat_destroy_fixer(ctx, plain);
+    gsf_splat_destroy(ctx, &linear);
+    repair_teardown(ctx, &r);
+    CHECK(memory.live == 0);
+}
+
 // Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
 // refused immediately, unless no rounds are requested.
 static void test_rigs(gsf_context* ctx) {
@@ -1340,6 +1445,7 @@ int main(void) {
     test_loop(&ctx);
     test_restore_views(&ctx);
     test_copies();
+    test_joined();
     test_rigs(&ctx);
     test_given_path(&ctx);
     test_native_frames(&ctx);

@@ -83,25 +83,39 @@ for frame in fixed/*.png; do # photos too small for stereo, so that nothing tell
     cmp -s "$frame" "clean/$(basename "$frame")" || fail "exposed without evidence: $frame"
 done
 
-# Copies: runs with the seeds that follow. Their splats are kept, and trained again by --resume where they are missing.
+# Copies: runs with the seeds that follow, joined. Their splats are kept, and trained again by --resume where they are missing.
 common="--views 3 --iterations 40 --init tracks --restorer mini:learned"
-"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 > /dev/null 2>&1 || fail "--copies"
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 > copies.txt 2> fix.txt ||
+    fail "--copies: $(tail -1 fix.txt)"
+grep -q "^one copy   PSNR" copies.txt || fail "--copies: nothing about one copy"
+"$gsfix" fix "$scene" --out single $common --seed 4 > /dev/null 2>&1
 "$gsfix" fix "$scene" --out next $common --seed 5 > /dev/null 2>&1
+cmp copies/copies/1.ply single/splats.ply || fail "the first copy is not the run itself"
 cmp copies/copies/2.ply next/splats.ply || fail "a copy is not the run with its seed"
-cp -r copies/filtered copies/copies/2.ply .
+python3 - << 'PY' || fail "metrics.json of --copies"
+import json
+m, single, other = (json.load(open(p + "/metrics.json")) for p in ("copies", "single", "next"))
+assert m["copies"] == 2 and m["psnr_first_copy"] == single["psnr"] and m["splats"] == single["splats"] + other["splats"]
+assert m["psnr"] != single["psnr"] and "copies" not in single, (m["psnr"], single["psnr"])
+PY
+cp -r copies/filtered copies/splats.ply copies/copies/2.ply .
 rm copies/copies/2.ply
-"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 --resume > /dev/null 2>&1 || fail "--copies --resume"
-cmp copies/copies/2.ply 2.ply && diff -r copies/filtered filtered || fail "--resume: other bytes"
+"$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --copies 2 --threads 1 --resume > /dev/null 2>&1 ||
+    fail "--copies --resume"
+cmp copies/copies/2.ply 2.ply && cmp copies/splats.ply splats.ply && diff -r copies/filtered filtered ||
+    fail "--resume: other bytes"
 "$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --resume > /dev/null 2>&1
 diff -qr copies/filtered filtered > /dev/null && fail "the copy changes nothing"
 "$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --restart > /dev/null 2>&1
-[ ! -e copies/copies/2.ply ] || fail "a copy of another run stays"
+[ ! -e copies/copies/1.ply ] && [ ! -e copies/copies/2.ply ] || fail "a copy of another run stays"
+"$gsfix" fix "$scene" --out joined --views 3 --iterations 40 --init tracks --copies 3 > /dev/null 2>&1 || fail "--copies alone"
+[ -s joined/copies/3.ply ] && [ ! -e joined/filtered ] || fail "--copies without a restorer"
 "$gsfix" render fix1/splats.ply --with next/splats.ply --scene "$scene" --views 3 --restorer mini --out both > /dev/null 2>&1
 [ "$(ls both/*.png | wc -l)" = "$(ls plain/*.png | wc -l)" ] || fail "--with: not all views are rendered"
 cmp -s both/frame_001.png clean/frame_001.png && fail "--with changes nothing"
 
 for wrong in "fix $scene --out x --restorer mini:" "fix $scene --out x --filtered" \
-    "fix $scene --out x --restorer mini --copies 2" "render fix1/splats.ply --scene $scene --out x --with fix1/splats.ply" \
+    "fix $scene --out x --restorer mini --copies 17" "render fix1/splats.ply --scene $scene --out x --with fix1/splats.ply" \
     "fix $scene --out x --restorer mini --fixed-exposure" "render fix1/splats.ply --scene $scene --out x --fixed-exposure" \
     "render fix1/splats.ply --path p.json --out x --restorer mini" "render fix1/splats.ply --scene $scene --out x --restorer dit:x"; do
     status=0
