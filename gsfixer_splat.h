@@ -726,7 +726,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fix
        gsf_splat_load_train_views        photos
        gsf_splat_make_initial_splats     points -> splats to begin with
        gsf_splat_resolve_few_view_desc   settings of the loop and of the trainer
-       gsf_splat_make_fixer              or gsf_splat_make_trainer with the desc's `train`, to train without repair
+       gsf_splat_make_fixer              or gsf_splat_make_trainer with the desc's `train`, to train without repair; once
+                                         more, with desc.copies, to join fixers that were trained with several seeds
    `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
 
 // Decodes the photos of these views, unless already present, and lists them for a trainer or fixer. *out is freed with

@@ -1182,6 +1182,7 @@ static gsf_result make_copy(fix_run* run, int copy) {
 static gsf_result join_copies(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const int count = (int)copy_count(run);
+    double clock = gsfix_now();
     gsf_result result = save_copy(run, 0, run->fixer);
     run->copies[0] = run->fixer;
     run->fixer = NULL;
@@ -1197,7 +1198,9 @@ static gsf_result join_copies(fix_run* run) {
     desc.copies = run->copies;
     desc.copy_count = (size_t)count;
     if (result == GSF_OK) result = make_fixer(run, &desc, NULL, &run->fixer);
-    return result == GSF_OK ? train_copy(run, run->fixer, count, "joining the copies") : result;
+    if (result == GSF_OK) result = train_copy(run, run->fixer, count, "joining the copies");
+    add_seconds(run, GSFIX_COPIES, &clock);
+    return result;
 }
 
 // ---- results ---------------------------------------------------------------------
@@ -1415,15 +1418,9 @@ static gsf_result finish(fix_run* run) {
     r.iterations = run->iterations;
     r.copies = copy_count(run);
     r.first_copy = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
-    gsf_result result = r.copies > 1 ? join_copies(run) : GSF_OK;
-    add_seconds(run, GSFIX_COPIES, &clock);
-    if (result != GSF_OK) {
-        gsf_free(ctx, views);
-        return result;
-    }
     r.splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     r.render = run->setup.fix.train.render;
-    if (!run->task) result = save_splats(run, r.splats);
+    gsf_result result = run->task ? GSF_OK : save_splats(run, r.splats);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);
@@ -1484,6 +1481,7 @@ gsf_result gsfix_fix_scene(gsfix_app* app, const gsfix_setup* setup, const gsfix
     gsf_result result = prepare(&run);
     run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
     if (result == GSF_OK) result = run_trainings(&run);
+    if (result == GSF_OK && copy_count(&run) > 1) result = join_copies(&run);
     if (result == GSF_OK) result = finish(&run);
     if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     free_run(&run);

@@ -750,6 +750,7 @@ static void put_header(page* p) {
     gsfix_put(p, "</h1><p class=lede>A 3D Gaussian Splatting scene from %zu photo%s, trained for %d steps", r->split->train_count,
         r->split->train_count == 1 ? "" : "s", (int)r->iterations);
     if (h->round_count) gsfix_put(p, " with %zu round%s of repair", h->round_count, h->round_count == 1 ? "" : "s");
+    if (r->copies > 1) gsfix_put(p, ", in %zu copies that were joined", r->copies);
     if (r->split->test_count) gsfix_put(p, ". The quality is measured on %zu photos that were not used for training", r->split->test_count);
     gsfix_put_raw(p, ".</p>\n");
 }
