@@ -252,7 +252,8 @@ static void put_tile(page* p, const char* name, double value, double without, in
     if (isnan(value)) return;
     gsfix_put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
     if (!isnan(without))
-        gsfix_put(p, "<p class=%s>%+.*f%s from repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
+        gsfix_put(p, "<p class=%s>%+.*f%s from repair %s</p>", value >= without ? "up" : "down", digits, value - without, unit,
+                  p->r->copies > 1 ? "and copies" : "alone");
     gsfix_put_raw(p, "</div>\n");
 }
 
