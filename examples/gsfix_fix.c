@@ -1154,8 +1154,6 @@ static gsf_result train_copy(fix_run* run, gsf_fixer* fixer, int copy, const cha
                            "%s: step %d  loss %.4f  %zu splats", name, (int)stats.train.iteration, stats.train.loss,
                            stats.train.splats);
     }
-    if (result == GSF_ERROR_CANCELLED)
-        result = gsf_fail(ctx, result, "stopped in %s; --resume goes on from %s/checkpoint", name, run->app->o.out);
     return result;
 }
 
@@ -1200,7 +1198,8 @@ static gsf_result join_copies(fix_run* run) {
     if (result == GSF_OK) result = make_fixer(run, &desc, NULL, &run->fixer);
     if (result == GSF_OK) result = train_copy(run, run->fixer, count, "joining the copies");
     add_seconds(run, GSFIX_COPIES, &clock);
-    return result;
+    if (result != GSF_ERROR_CANCELLED) return result;
+    return gsf_fail(ctx, result, "stopped in the copies; --resume goes on from %s/checkpoint", run->app->o.out);
 }
 
 // ---- results ---------------------------------------------------------------------
