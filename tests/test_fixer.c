@@ -753,6 +753,16 @@ static void tint_end(void* user, gsf_context* ctx) {
     ((tinter*)user)->open = 0;
 }
 
+static gsf_restorer tint_restorer(const repair* r, tinter* tint) {
+    gsf_restorer restorer = r->restorer;
+    restorer.user = tint;
+    restorer.query_fn = tint_query;
+    restorer.begin_fn = tint_begin;
+    restorer.restore_fn = tint_restore;
+    restorer.end_fn = tint_end;
+    return restorer;
+}
+
 // Views of several fixers: the mean of what the restorer makes of each one's renders, and the less of it the more this differs
 // beyond the renders.
 static void test_copies(void) {
@@ -766,12 +776,7 @@ static void test_copies(void) {
     count_memory(ctx, &memory);
     CHECK_OK(ctx, gsf_init_context(ctx));
     repair_setup(ctx, &r);
-    gsf_restorer restorer = r.restorer;
-    restorer.user = &tint;
-    restorer.query_fn = tint_query;
-    restorer.begin_fn = tint_begin;
-    restorer.restore_fn = tint_restore;
-    restorer.end_fn = tint_end;
+    const gsf_restorer restorer = tint_restorer(&r, &tint);
     const gsf_fix_desc desc = repair_desc();
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &twins[0]));
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &twins[1]));
@@ -849,12 +854,7 @@ static void test_joined(void) {
     count_memory(ctx, &memory);
     CHECK_OK(ctx, gsf_init_context(ctx));
     repair_setup(ctx, &r);
-    gsf_restorer restorer = r.restorer;
-    restorer.user = &tint;
-    restorer.query_fn = tint_query;
-    restorer.begin_fn = tint_begin;
-    restorer.restore_fn = tint_restore;
-    restorer.end_fn = tint_end;
+    const gsf_restorer restorer = tint_restorer(&r, &tint);
     gsf_fix_desc desc = repair_desc();
     for (int i = 0; i < 2; i++)
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.truth, &restorer, &copies[i]));
