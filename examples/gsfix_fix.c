@@ -215,8 +215,9 @@ typedef struct fix_run {
     int has_restorer;
     int comparing; // set during the run without repair, the first one of --compare
     const gsfix_fix_task* task; // of another command, or NULL
-    gsf_fixer* fixer;
+    gsf_fixer* fixer; // what is trained now, at the end what is measured
     gsf_fixer* copies[GSFIX_COPIES_MOST]; // those of --copies, once the run itself, the first of them, is done
+    int copy;         // trained now: 0 the run itself, then the others, their number for what joins them
     gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
@@ -224,7 +225,7 @@ typedef struct fix_run {
     int checkpoint_failed; // the last checkpoint could not be written
     const char* rays; // backend that traced the visibility rays
     gsfix_history history;
-    double total_before; // seconds spent by the earlier runs that this one continues
+    double total_before, seconds_before[GSFIX_STAGES]; // spent by the earlier runs that this one continues
     int32_t iteration, iterations, eval_every, checkpoint_every;
     double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds for the last one and for all; end time of the last
 } fix_run;
@@ -236,6 +237,7 @@ static gsfix_path copy_file(int copy) { return gsfix_pathf("copies/%d.ply", copy
 static void add_seconds(fix_run* run, int stage, double* since) {
     const double now = gsfix_now();
     if (run->comparing && stage != GSFIX_CHECKPOINT) stage = GSFIX_COMPARE;
+    if (run->copy && stage != GSFIX_CHECKPOINT) stage = GSFIX_COPIES;
     run->history.seconds[stage] += now - *since;
     *since = now;
 }
@@ -396,8 +398,8 @@ static gsf_result evaluate_filtered(fix_run* run, gsfix_score* scores) {
 
 static gsf_result add_curve_point(fix_run* run) {
     gsfix_history* h = &run->history;
-    if (run->task || !run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration))
-        return GSF_OK;
+    if (run->task || run->copy || !run->split.test_count) return GSF_OK;
+    if (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration) return GSF_OK;
     gsf_result result = GROW(run->ctx, h, curve, curve);
     gsfix_score* scores = (gsfix_score*)gsf_alloc(run->ctx, run->split.test_count, sizeof *scores);
     if (!scores) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -552,6 +554,11 @@ static void write_curve_rows(gsf_context* ctx, gsf_buffer* t, const char* key, c
     gsfix_json_end(ctx, t, ']');
 }
 
+static void write_times(const fix_run* run, gsf_buffer* t) {
+    write_list(run->ctx, t, "seconds", run->history.seconds, GSFIX_STAGES);
+    gsfix_json_number(run->ctx, t, "seconds_total", run->total_before + gsfix_now() - run->app->started);
+}
+
 // The history as JSON: lists of numbers, so that each list is read back by one loop.
 static void write_history(fix_run* run, gsf_buffer* t) {
     gsf_context* ctx = run->ctx;
@@ -568,8 +575,7 @@ static void write_history(fix_run* run, gsf_buffer* t) {
         gsfix_json_end(ctx, t, ']');
     }
     gsfix_json_end(ctx, t, ']');
-    write_list(ctx, t, "seconds", h->seconds, GSFIX_STAGES);
-    gsfix_json_number(ctx, t, "seconds_total", run->total_before + gsfix_now() - run->app->started);
+    write_times(run, t);
     gsfix_json_number(ctx, t, "iteration", run->iteration);
     gsfix_json_number(ctx, t, "resumed", h->resumed);
     gsfix_json_number(ctx, t, "comparing", run->comparing);
@@ -602,19 +608,37 @@ static void write_history(fix_run* run, gsf_buffer* t) {
     gsfix_json_end(ctx, t, '}');
 }
 
+// Copies have a checkpoint of their own, so that the run's, complete by then, stays one of a run without them.
+static const char* checkpoint_file(const fix_run* run) { return run->copy ? "copies/checkpoint" : "checkpoint"; }
+
+static int joined_copies(const fix_run* run) { // how many are being joined
+    return run->copy && run->copy == (int)copy_count(run) ? run->copy : 0;
+}
+
+static void write_copy(const fix_run* run, gsf_buffer* t) { // what the checkpoint of a copy says beside its state
+    gsf_context* ctx = run->ctx;
+    gsfix_json_begin(ctx, t, NULL, '{');
+    write_times(run, t);
+    gsfix_json_number(ctx, t, "iteration", run->iteration);
+    gsfix_json_number(ctx, t, "copy", run->copy);
+    gsfix_json_number(ctx, t, "joined", joined_copies(run));
+    gsfix_json_end(ctx, t, '}');
+}
+
 static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_buffer chunks = {0}, history = {0};
+    gsf_buffer chunks = {0}, json = {0};
     const double begin = gsfix_now();
-    write_history(run, &history);
+    if (run->copy) write_copy(run, &json);
+    else write_history(run, &json);
     gsf_splat_format_fixer(ctx, run->fixer, &chunks);
-    gsf_append_chunk(ctx, &chunks, "GFIX", history.data, history.size);
+    gsf_append_chunk(ctx, &chunks, "GFIX", json.data, json.size);
     gsf_append_last_chunk(ctx, &chunks);
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    if (!history.failed && !chunks.failed)
-        result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks.data, chunks.size);
+    if (!json.failed && !chunks.failed)
+        result = gsf_write_file(ctx, gsfix_pathf("%s/%s", run->app->o.out, checkpoint_file(run)).s, chunks.data, chunks.size);
     gsf_destroy_buffer(ctx, &chunks);
-    gsf_destroy_buffer(ctx, &history);
+    gsf_destroy_buffer(ctx, &json);
     run->checkpoint_end = gsfix_now();
     run->checkpoint_last = run->checkpoint_end - begin;
     run->checkpoint_sum += run->checkpoint_last;
@@ -741,14 +765,24 @@ static gsf_result take_row(fix_run* run, int list, const double* x) {
     return result;
 }
 
+static void read_times(fix_run* run, const gsf_json* json) { // in place of those read before
+    const gsf_json_value* seconds = gsf_find_json_member(json, &json->values[0], "seconds");
+    const gsf_json_value* total = gsf_find_json_member(json, &json->values[0], "seconds_total");
+    for (size_t i = 0; i < GSFIX_STAGES; i++) {
+        const gsf_json_value* s = gsf_find_json_element(json, seconds, i);
+        if (!s || s->type != GSF_JSON_NUMBER || !isfinite(s->number)) continue;
+        run->history.seconds[i] += s->number - run->seconds_before[i];
+        run->seconds_before[i] = s->number;
+    }
+    if (total && total->type == GSF_JSON_NUMBER && isfinite(total->number)) run->total_before = total->number;
+}
+
 static gsf_result read_history(fix_run* run, const char* name, const gsf_json* json) {
     static const struct { const char *key, *kinds; } lists[] = {
         {"curve", "wcnn"}, {"rounds", "wwwwwf"}, {"path", "wwiffffff"}, {"without_curve", "wcnn"},
         {"samples", "www"}};
     gsf_context* ctx = run->ctx;
     gsfix_history* h = &run->history;
-    const gsf_json_value* seconds = gsf_find_json_member(json, &json->values[0], "seconds");
-    const gsf_json_value* total = gsf_find_json_member(json, &json->values[0], "seconds_total");
     const gsf_json_value* resumed = whole_member(json, "resumed", 1e9);
     const gsf_json_value* iteration = whole_member(json, "iteration", run->iterations);
     const gsf_json_value* comparing = whole_member(json, "comparing", run->app->o.compare);
@@ -759,11 +793,7 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
     h->resumed = (int32_t)resumed->number + (resumed->number < 1e9); // capped at the largest value that can be read back
     run->iteration = (int32_t)iteration->number;
     run->comparing = (int)comparing->number;
-    for (size_t i = 0; i < GSFIX_STAGES; i++) {
-        const gsf_json_value* s = gsf_find_json_element(json, seconds, i);
-        if (s && s->type == GSF_JSON_NUMBER && isfinite(s->number)) h->seconds[i] += s->number;
-    }
-    if (total && total->type == GSF_JSON_NUMBER && isfinite(total->number)) run->total_before = total->number;
+    read_times(run, json);
     gsf_result result = read_rows(run, name, json, "without", "nnnn", &r, &n);
     if (result == GSF_OK && n && n != h->view_count)
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: \"without\" has %zu views, the scene %zu", name, n, h->view_count);
@@ -895,6 +925,7 @@ static gsf_result open_fix_out(fix_run* run) {
         if (result == GSF_OK && app->o.filtered) result = gsfix_claim(app, "filtered/%s.png", stem.s);
     }
     for (int i = 0; i < app->o.copies && result == GSF_OK; i++) result = gsfix_claim(app, "%s", copy_file(i).s);
+    if (result == GSF_OK && app->o.copies > 1) result = gsfix_claim(app, "copies/checkpoint");
     for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app) && !run->task; i++)
         result = gsfix_claim(app, "%s", repair[i]);
     if (result == GSF_OK && run->task) result = run->task->claim_fn(app, run->task->user);
@@ -946,6 +977,7 @@ static gsf_result prepare(fix_run* run) {
     else result = gsfix_remove_output(app, "checkpoint");
     for (int i = 0; i < app->o.copies && result == GSF_OK && !run->resuming; i++)
         result = gsfix_remove_output(app, copy_file(i).s); // of another run
+    if (result == GSF_OK && !run->resuming && app->o.copies > 1) result = gsfix_remove_output(app, "copies/checkpoint");
     if (result == GSF_OK && !run->resuming && run->comparing) result = start_fixer(run);
     if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
     if (result == GSF_OK) tell_start(run);
@@ -1022,6 +1054,8 @@ static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
     return result;
 }
 
+static int32_t last_step(const fix_run* run) { return gsf_splat_get_fixer_desc(run->fixer).train.iterations; }
+
 // Work due after a step: images, held-out scores, checkpoint. The step itself is already complete.
 static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* clock) {
     gsf_result result = GSF_OK;
@@ -1029,7 +1063,7 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
     if (stats->stage == GSF_FIX_TRAIN) {
         run->iteration = stats->train.iteration;
         add_seconds(run, run->history.round_count ? GSFIX_DISTILL : GSFIX_TRAIN, clock);
-        if (run->iteration % run->eval_every == 0 || run->iteration == run->iterations) result = add_curve_point(run);
+        if (run->iteration % run->eval_every == 0 || run->iteration == last_step(run)) result = add_curve_point(run);
         add_seconds(run, GSFIX_RENDER, clock);
         due = run->iteration % run->checkpoint_every == 0;
     } else if (stats->stage == GSF_FIX_PLAN || stats->stage == GSF_FIX_RESTORE) {
@@ -1037,39 +1071,40 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
         result = add_curve_point(run);
         add_seconds(run, GSFIX_RENDER, clock);
         if (result == GSF_OK && stats->stage == GSF_FIX_RESTORE) {
-            result = after_window(run, stats);
+            if (!run->copy) result = after_window(run, stats);
             due = 1;
         }
     }
     add_seconds(run, GSFIX_SAVE, clock);
-    if (stats->stage == GSF_FIX_TRAIN && run->iteration == run->iterations) due = 1;
+    if (stats->stage == GSF_FIX_TRAIN && run->iteration == last_step(run)) due = 1;
     else if (due && !run->app->o.checkpoint_every) due = checkpoint_pays(run, stats->stage == GSF_FIX_RESTORE);
     if (result == GSF_OK && due) keep_checkpoint(run);
     add_seconds(run, GSFIX_CHECKPOINT, clock);
     return result;
 }
 
-// Steps before the one that trains a copy begins, the number of copies for what joins them.
-static double steps_before(const fix_run* run, int copy) {
-    return (double)run->iterations * ((run->app->o.compare ? 1.0 : 0.0) + copy);
+static double all_steps(const fix_run* run) {
+    const double n = run->iterations, copies = (double)copy_count(run);
+    return n * ((run->app->o.compare ? 1.0 : 0.0) + copies) + (copies > 1.0 ? floor(n / 8.0) : 0.0); // joining takes an eighth
 }
 
-static double all_steps(const fix_run* run) {
-    const int copies = (int)copy_count(run);
-    return steps_before(run, copies) + (copies > 1 ? floor(run->iterations / 8.0) : 0.0); // joining them takes an eighth
+static gsfix_path name_training(const fix_run* run) { // what is trained now, as a part of a line; nothing for the run itself
+    if (run->comparing) return gsfix_pathf("without repair: ");
+    if (joined_copies(run)) return gsfix_pathf("joining the copies: ");
+    return run->copy ? gsfix_pathf("copy %d of %d: ", run->copy + 1, (int)copy_count(run)) : gsfix_pathf("%s", "");
 }
 
 static void show_step(fix_run* run, const gsf_fix_stats* stats) {
     const gsfix_history* h = &run->history;
     const double psnr = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
     char held_out[48] = "";
-    if (!isnan(psnr)) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
-    const double before = run->app->o.compare && !run->comparing ? run->iterations : 0.0, done = before + run->iteration;
-    const double all = all_steps(run);
+    if (!isnan(psnr) && !run->copy) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
+    const double before = (double)run->iterations * ((run->app->o.compare && !run->comparing ? 1 : 0) + run->copy);
+    const double done = before + run->iteration, all = all_steps(run);
     if (stats->stage == GSF_FIX_TRAIN)
-        gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s",
-                       run->comparing ? "without repair: " : "",
-                       (int)run->iteration, (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
+        gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s", name_training(run).s,
+                       (int)run->iteration, (int)last_step(run), stats->train.loss, stats->train.splats, held_out);
+    else if (run->copy) return;
     else if (stats->stage == GSF_FIX_RESTORE && run->app->terminal)
         gsfix_progress(run->app, done, all, "round %d of %d: window %d of %d %s",
                        (int)stats->round, (int)stats->rounds, (int)stats->window, (int)stats->windows,
@@ -1099,11 +1134,13 @@ static gsf_result run_loop(fix_run* run) {
     result = save_checkpoint(run);
     char why[sizeof ctx->error] = "out of memory";
     if (result != GSF_ERROR_OUT_OF_MEMORY) memcpy(why, ctx->error, sizeof why);
+    const gsfix_path name = name_training(run);
+    const int step = (int)run->iteration, last = (int)last_step(run);
     if (result != GSF_OK)
-        return gsf_fail(ctx, result, "stopped at step %d of %d without a checkpoint%s: %.300s", (int)run->iteration,
-                        (int)run->iterations, gsfix_has_output(run->app, "checkpoint") ? " (an older one stays)" : "", why);
-    return gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped at step %d of %d; --resume goes on from %s/checkpoint",
-                    (int)run->iteration, (int)run->iterations, run->app->o.out);
+        return gsf_fail(ctx, result, "%sstopped at step %d of %d without a checkpoint%s: %.300s", name.s, step, last,
+                        gsfix_has_output(run->app, checkpoint_file(run)) ? " (an older one stays)" : "", why);
+    return gsf_fail(ctx, GSF_ERROR_CANCELLED, "%sstopped at step %d of %d; --resume goes on from %s/%s", name.s, step, last,
+                    run->app->o.out, checkpoint_file(run));
 }
 
 // The run without repair is complete: keeps its scores and images, discards its splats.
@@ -1135,44 +1172,56 @@ static gsf_result run_trainings(fix_run* run) {
 
 // ---- copies ----------------------------------------------------------------------
 
-static gsf_result save_copy(fix_run* run, int copy, const gsf_fixer* fixer) {
-    gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(fixer));
+static gsf_result save_copy(fix_run* run) {
+    gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     view.antialiased = run->setup.fix.train.render.antialiased;
-    return gsf_splat_save(run->ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(copy).s).s, &view, NULL);
+    return gsf_splat_save(run->ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(run->copy).s).s, &view, NULL);
 }
 
-// Trains a copy to its end, or what joins them.
-static gsf_result train_copy(fix_run* run, gsf_fixer* fixer, int copy, const char* name) {
+// Trains a copy, or what joins them. The first that this process trains goes on from the checkpoint, if that is of it.
+static gsf_result train_copy(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_result result = GSF_OK;
-    while (result == GSF_OK) {
-        gsf_fix_stats stats;
-        result = gsf_splat_step_fixer(ctx, fixer, &stats);
-        if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
-        if (stats.stage == GSF_FIX_TRAIN)
-            gsfix_progress(run->app, steps_before(run, copy) + stats.train.iteration, all_steps(run),
-                           "%s: step %d  loss %.4f  %zu splats", name, (int)stats.train.iteration, stats.train.loss,
-                           stats.train.splats);
-    }
-    return result;
+    const gsfix_path path = gsfix_pathf("%s/%s", run->app->o.out, checkpoint_file(run));
+    void* data = NULL;
+    size_t size = 0;
+    gsf_json json = {0};
+    run->iteration = 0;
+    const int first = run->resuming && gsfix_has_output(run->app, checkpoint_file(run));
+    run->resuming = 0;
+    if (!first) return run_loop(run);
+    gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
+    const gsf_json_value* copy = result == GSF_OK ? whole_member(&json, "copy", GSFIX_COPIES_MOST) : NULL;
+    const gsf_json_value* joined = result == GSF_OK ? whole_member(&json, "joined", GSFIX_COPIES_MOST) : NULL;
+    const gsf_json_value* iteration = result == GSF_OK ? whole_member(&json, "iteration", last_step(run)) : NULL;
+    if (result == GSF_OK && (!copy || !joined))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: does not tell of which copy it is", path.s);
+    const int mine = result == GSF_OK && (int)copy->number == run->copy && (int)joined->number == joined_copies(run);
+    if (mine && !iteration) result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps", path.s);
+    if (mine && result == GSF_OK) run->iteration = (int32_t)iteration->number;
+    if (mine && result == GSF_OK) result = gsf_splat_parse_fixer(ctx, run->fixer, path.s, data, size);
+    if (result == GSF_OK) read_times(run, &json); // of what was done before it, too
+    gsf_destroy_json(ctx, &json);
+    gsf_free(ctx, data);
+    return result == GSF_OK ? run_loop(run) : result;
 }
 
 // Trains a copy as a run with its seed would, and saves its splats.
-static gsf_result make_copy(fix_run* run, int copy) {
+static gsf_result make_copy(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    const gsf_fix_desc desc = fixer_desc(run, copy);
-    const gsfix_path name = gsfix_pathf("copy %d of %d", copy + 1, (int)copy_count(run));
+    const gsf_fix_desc desc = fixer_desc(run, run->copy);
     gsf_initial_desc start = run->setup.initial;
     gsf_splats initial = {0};
-    gsf_fixer* fixer = NULL;
-    start.seed += (uint64_t)copy;
+    double clock = gsfix_now();
+    start.seed += (uint64_t)run->copy;
     gsf_result result = gsf_splat_make_initial_splats(ctx, &run->scene, run->split.train, run->split.train_count, &start,
                                                       &initial, NULL);
-    if (result == GSF_OK) result = make_fixer(run, &desc, &initial, &fixer);
+    if (result == GSF_OK) result = make_fixer(run, &desc, &initial, &run->fixer);
     gsf_splat_destroy(ctx, &initial);
-    if (result == GSF_OK) result = train_copy(run, fixer, copy, name.s);
-    if (result == GSF_OK) result = save_copy(run, copy, fixer);
-    gsf_splat_destroy_fixer(ctx, fixer);
+    add_seconds(run, GSFIX_COPIES, &clock);
+    if (result == GSF_OK) result = train_copy(run);
+    if (result == GSF_OK) result = save_copy(run);
+    gsf_splat_destroy_fixer(ctx, run->fixer);
+    run->fixer = NULL;
     return result;
 }
 
@@ -1180,26 +1229,25 @@ static gsf_result make_copy(fix_run* run, int copy) {
 static gsf_result join_copies(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const int count = (int)copy_count(run);
-    double clock = gsfix_now();
-    gsf_result result = save_copy(run, 0, run->fixer);
+    gsf_result result = save_copy(run);
     run->copies[0] = run->fixer;
     run->fixer = NULL;
-    for (int i = 1; i < count && result == GSF_OK; i++) {
-        const gsf_fix_desc desc = fixer_desc(run, i);
+    for (run->copy = 1; run->copy < count && result == GSF_OK; run->copy++) {
+        const gsfix_path file = copy_file(run->copy);
+        const gsf_fix_desc desc = fixer_desc(run, run->copy);
         gsf_splats splats = {0};
-        if (!gsfix_has_output(run->app, copy_file(i).s)) result = make_copy(run, i);
-        if (result == GSF_OK) result = gsf_splat_load(ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(i).s).s, &splats);
-        if (result == GSF_OK) result = make_fixer(run, &desc, &splats, &run->copies[i]);
+        if (!gsfix_has_output(run->app, file.s)) result = make_copy(run);
+        if (result == GSF_OK) result = gsf_splat_load(ctx, gsfix_pathf("%s/%s", run->app->o.out, file.s).s, &splats);
+        if (result == GSF_OK) result = make_fixer(run, &desc, &splats, &run->copies[run->copy]);
         gsf_splat_destroy(ctx, &splats);
     }
     gsf_fix_desc desc = fixer_desc(run, 0);
     desc.copies = run->copies;
     desc.copy_count = (size_t)count;
     if (result == GSF_OK) result = make_fixer(run, &desc, NULL, &run->fixer);
-    if (result == GSF_OK) result = train_copy(run, run->fixer, count, "joining the copies");
-    add_seconds(run, GSFIX_COPIES, &clock);
-    if (result != GSF_ERROR_CANCELLED) return result;
-    return gsf_fail(ctx, result, "stopped in the copies; --resume goes on from %s/checkpoint", run->app->o.out);
+    if (result == GSF_OK) result = train_copy(run);
+    run->copy = 0;
+    return result;
 }
 
 // ---- results ---------------------------------------------------------------------
@@ -1350,8 +1398,8 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     char also[64] = "";
     for (int i = 0; i < ALSO_COUNT; i++)
         if (wants_also(app, i)) snprintf(also + strlen(also), sizeof also - strlen(also), "  splats.%s", also_formats[i]);
-    gsfix_print(app, "wrote      %s/report.html  splats.ply%s  metrics.json  test/%s", app->o.out, also,
-                h->round_count ? "  fixed/" : "");
+    gsfix_print(app, "wrote      %s/report.html  splats.ply%s  metrics.json  test/%s%s%s", app->o.out, also,
+                h->round_count ? "  fixed/" : "", r->filtered_views ? "  filtered/" : "", r->copies > 1 ? "  copies/" : "");
 }
 
 static gsf_result save_splats(fix_run* run, const gsf_splats* splats) {

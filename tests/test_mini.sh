@@ -104,6 +104,22 @@ rm copies/copies/2.ply
     fail "--copies --resume"
 cmp copies/copies/2.ply 2.ply && cmp copies/splats.ply splats.ply && diff -r copies/filtered filtered ||
     fail "--resume: other bytes"
+interrupt() { # MARK: kill -9 of a new run, or of one that goes on, when MARK is in its copies' checkpoint
+    "$gsfix" fix "$scene" --out broken $common --seed 4 --filtered --copies 2 --checkpoint-every 1 --resume > /dev/null 2>&1 &
+    pid=$!
+    while kill -0 "$pid" 2> /dev/null && ! grep -aq "$1" broken/copies/checkpoint 2> /dev/null; do sleep 0.01; done
+    kill -9 "$pid" 2> /dev/null || fail "not killed at $1"
+    wait "$pid" 2> /dev/null || true
+}
+interrupt '"copy":1,'
+[ -e broken/copies/1.ply ] && [ ! -e broken/copies/2.ply ] || fail "killed outside the second copy"
+interrupt '"copy":2,'
+[ -e broken/copies/2.ply ] && [ ! -e broken/splats.ply ] || fail "killed outside the joining"
+"$gsfix" fix "$scene" --out broken $common --seed 4 --filtered --copies 2 --resume > /dev/null 2> fix.txt ||
+    fail "--copies --resume after kill -9: $(tail -1 fix.txt)"
+cmp broken/splats.ply splats.ply && diff -r broken/filtered filtered || fail "kill -9 in the copies: other bytes"
+printf '{}' > broken/copies/checkpoint # no longer this program's
+"$gsfix" fix "$scene" --out broken $common --seed 4 --filtered --copies 2 --resume > /dev/null 2>&1 && fail "a foreign checkpoint"
 "$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --resume > /dev/null 2>&1
 diff -qr copies/filtered filtered > /dev/null && fail "the copy changes nothing"
 "$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --restart > /dev/null 2>&1
