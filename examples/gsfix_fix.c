@@ -1085,7 +1085,8 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
 
 static double all_steps(const fix_run* run) {
     const double n = run->iterations, copies = (double)copy_count(run);
-    return n * ((run->app->o.compare ? 1.0 : 0.0) + copies) + (copies > 1.0 ? floor(n / 8.0) : 0.0); // joining takes an eighth
+    const double joining = copies > 1.0 ? fmax(1.0, floor(n / 8.0)) : 0.0; // as gsf_splat_make_fixer has it
+    return n * ((run->app->o.compare ? 1.0 : 0.0) + copies) + joining;
 }
 
 static gsfix_path name_training(const fix_run* run) { // what is trained now, as a part of a line; nothing for the run itself
