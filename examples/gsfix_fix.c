@@ -1171,13 +1171,13 @@ static gsf_result run_trainings(fix_run* run) {
     return run_loop(run);
 }
 
-// ---- copies ----------------------------------------------------------------------
-
-static gsf_result save_copy(fix_run* run) {
+static gsf_result save_trained(fix_run* run, const char* file) { // the splats as they are now
     gsf_splats view = *gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     view.antialiased = run->setup.fix.train.render.antialiased;
-    return gsf_splat_save(run->ctx, gsfix_pathf("%s/%s", run->app->o.out, copy_file(run->copy).s).s, &view, NULL);
+    return gsf_splat_save(run->ctx, gsfix_pathf("%s/%s", run->app->o.out, file).s, &view, NULL);
 }
+
+// ---- copies ----------------------------------------------------------------------
 
 // Trains a copy, or what joins them. The first that this process trains goes on from the checkpoint, if that is of it.
 static gsf_result train_copy(fix_run* run) {
@@ -1220,7 +1220,7 @@ static gsf_result make_copy(fix_run* run) {
     gsf_splat_destroy(ctx, &initial);
     add_seconds(run, GSFIX_COPIES, &clock);
     if (result == GSF_OK) result = train_copy(run);
-    if (result == GSF_OK) result = save_copy(run);
+    if (result == GSF_OK) result = save_trained(run, copy_file(run->copy).s);
     gsf_splat_destroy_fixer(ctx, run->fixer);
     run->fixer = NULL;
     return result;
@@ -1230,7 +1230,7 @@ static gsf_result make_copy(fix_run* run) {
 static gsf_result join_copies(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const int count = (int)copy_count(run);
-    gsf_result result = save_copy(run);
+    gsf_result result = save_trained(run, copy_file(0).s);
     run->copies[0] = run->fixer;
     run->fixer = NULL;
     for (run->copy = 1; run->copy < count && result == GSF_OK; run->copy++) {
@@ -1403,15 +1403,10 @@ static void print_results(fix_run* run, const gsfix_result* r) {
                 h->round_count ? "  fixed/" : "", r->filtered_views ? "  filtered/" : "", r->copies > 1 ? "  copies/" : "");
 }
 
-static gsf_result save_splats(fix_run* run, const gsf_splats* splats) {
-    gsf_context* ctx = run->ctx;
-    const char* out = run->app->o.out;
-    gsf_splats view = *splats;
-    view.antialiased = run->setup.fix.train.render.antialiased;
-    gsf_result result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.ply", out).s, &view, NULL);
+static gsf_result save_splats(fix_run* run) {
+    gsf_result result = save_trained(run, "splats.ply");
     for (int i = 0; i < ALSO_COUNT && result == GSF_OK; i++)
-        if (wants_also(run->app, i))
-            result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.%s", out, also_formats[i]).s, &view, NULL);
+        if (wants_also(run->app, i)) result = save_trained(run, gsfix_pathf("splats.%s", also_formats[i]).s);
     return result;
 }
 
@@ -1468,7 +1463,7 @@ static gsf_result finish(fix_run* run) {
     r.first_copy = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
     r.splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     r.render = run->setup.fix.train.render;
-    gsf_result result = run->task ? GSF_OK : save_splats(run, r.splats);
+    gsf_result result = run->task ? GSF_OK : save_splats(run);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);

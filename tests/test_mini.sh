@@ -124,7 +124,8 @@ printf '{}' > broken/copies/checkpoint # no longer this program's
 diff -qr copies/filtered filtered > /dev/null && fail "the copy changes nothing"
 "$gsfix" fix "$scene" --out copies $common --seed 4 --filtered --restart > /dev/null 2>&1
 [ ! -e copies/copies/1.ply ] && [ ! -e copies/copies/2.ply ] || fail "a copy of another run stays"
-"$gsfix" fix "$scene" --out joined --views 3 --iterations 6 --init tracks --copies 3 > /dev/null 2> fix.txt || fail "--copies alone"
+"$gsfix" fix "$scene" --out joined --views 3 --iterations 40 --init tracks --copies 3 > /dev/null 2>&1 || fail "--copies alone"
+"$gsfix" fix "$scene" --out few --views 3 --iterations 6 --init tracks --copies 3 > /dev/null 2> fix.txt || fail "few steps"
 tail -1 fix.txt | grep -q "100 %.*joining the copies: step 1 of 1 " || fail "progress of --copies: $(tail -1 fix.txt)"
 [ -s joined/copies/3.ply ] && [ ! -e joined/filtered ] || fail "--copies without a restorer"
 "$gsfix" render fix1/splats.ply --with next/splats.ply --scene "$scene" --views 3 --restorer mini --out both > /dev/null 2>&1
