@@ -14604,6 +14604,8 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) { // of round
         gsf__spread_path(f);
         return GSF_OK;
     }
+    if (f->view_count < 2)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "fix: one photo: repair takes a second one, or cameras given as a path");
     gsf_traj_path_desc desc;
     gsf_traj_path_info layout;
     memset(&desc, 0, sizeof desc);

@@ -1013,7 +1013,13 @@ static void test_given_path(gsf_context* ctx) {
         CHECK(jumps == 2 * ((counts[k] < 18 ? counts[k] : 18) - 1));
         gsf_splat_destroy_fixer(ctx, fixer);
     }
-    gsf_fixer* fixer = NULL;
+    gsf_fixer* fixer = NULL; // one photo: the path must be given
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, 1, &r.start, &r.restorer, &fixer));
+    gsf_splat_destroy_fixer(ctx, fixer);
+    desc.path_count = 0;
+    CHECK(gsf_splat_make_fixer(ctx, &desc, r.views, 1, &r.start, &r.restorer, &fixer) == GSF_ERROR_DEGENERATE);
+    CHECK(strstr(ctx->error, "one photo") != NULL);
+    desc.path_count = 40;
     path[3].fx = -1.0;
     CHECK(gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer) != GSF_OK && !fixer);
     desc.path = NULL;
