@@ -625,8 +625,8 @@ typedef struct gsf_nn_mini_desc {
 
 /* A small network that repairs frames from the photos carried into them (gsf_restore_window.carry_fn): per pixel it weighs
    the render, the photos and the render with the photos' residuals against each other, and predicts the error that remains,
-   from which the confidence is made. Where no photo shows anything, the render stays, with confidence 0; where no other photo
-   confirms what one shows, it changes as far as its opacity goes. It takes frames of any size and any number.
+   from which the confidence is made. Where no photo shows anything, the render stays, with confidence 0. It takes frames of
+   any size and any number.
    Weights are f32, bf16, f16, or 8-bit integers with a factor per output:
    NAME.weight as I8 with NAME.weight_scale, the layout of compressed-tensors. A host embeds it in three lines:
        gsf_nn_mini_desc desc = {0};
@@ -15793,8 +15793,7 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
    only which of them are right. It also predicts the error that remains (its logarithm), from which the confidence is made,
    and the error of the render. Where the latter is below that of renders of 35 dB the render stays as it is (gsf__mini_gate):
    weights of a softmax are never 0, and small changes everywhere would spoil what is good already. What the network paints
-   where no reference shows anything (its training asks for that, too) is not used, and only a part of it where nothing
-   confirms what one shows: gsf__mini_write.
+   where no reference shows anything (its training asks for that, too) is not used: gsf__mini_write.
 
        planes of each reference -> unshuffle 2 -> 1x1 -> 3x3 -> features --+--> mean by softmax, maximum --+
                                                                             |                              v
@@ -16148,19 +16147,10 @@ static void gsf__mini_relu(gsf__mini_run* r, float* x, int64_t count) {
     gsf__nn_activate(r->ctx, GSF__NN_RELU, x, count, x);
 }
 
-static float gsf__mini_score(float score) { return 0.2f + 0.8f * score; } // as a reference's plane
-
 // Whether any of `count` pixels of references, `pitch` floats apart, shows anything.
 static int gsf__mini_shows(const float* shown, int64_t count, int64_t pitch) {
     for (int64_t i = 0; i < count; i++, shown += pitch)
         if (shown[6] > 0.0f || shown[12] > 0.0f) return 1;
-    return 0;
-}
-
-// Whether another photo confirms what any of them shows.
-static int gsf__mini_confirms(const float* shown, int64_t count, int64_t pitch) {
-    for (int64_t i = 0; i < count; i++, shown += pitch)
-        if (shown[6] >= gsf__mini_score(0.5f)) return 1;
     return 0;
 }
 
@@ -16406,7 +16396,7 @@ GSF__SHARED void gsf__mini_plane_reference(const gsf_carried* c, const gsf_image
                     out[i] = gsf__mini_clamp(gsf__mini_row(&c->color, y)[3 * x + i], 0.0f, 1.0f);
                     out[3 + i] = gsf__mini_clamp(gsf__mini_row(&c->residual, y)[3 * x + i], -1.0f, 1.0f);
                 }
-                out[6] = gsf__mini_clamp(gsf__mini_score(score), 0.0f, 1.0f);
+                out[6] = gsf__mini_clamp(0.2f + 0.8f * score, 0.0f, 1.0f);
                 out[7] = gsf__mini_ratio(gsf__mini_row(&c->depth, y)[x], gsf__mini_row(depth, y)[x], -1.0f);
                 out[8] = expf(-12.5f * angle * angle);
             }
@@ -16499,8 +16489,7 @@ static gsf_result gsf__mini_fit(gsf_context* ctx, gsf__mini_restorer* r, int64_t
 
 // Writes the frame's restored colours, and the weight of a pixel in training: s^2 / (s^2 + b^2) for an expected error b. Where
 // no reference shows anything, the render stays, with weight 0: guesses make it worse, and splats that train on them make the
-// render of the next guess. Where no other photo confirms what a reference shows, the render stays as far as light passes the
-// splats: what puts a photo there is the depth of the few that stop it. Measured in bench/TRIED.md
+// render of the next guess.
 static void gsf__mini_write(const gsf__mini_restorer* r, const float* shown, const gsf_image* color,
                             const gsf_image* confidence) {
     const float square = r->desc.sigma * r->desc.sigma, *frame = r->planes;
@@ -16510,10 +16499,9 @@ static void gsf__mini_write(const gsf__mini_restorer* r, const float* shown, con
         char *to = (char*)color->data + y * color->stride_y, *weight = (char*)confidence->data + y * confidence->stride_y;
         for (int64_t x = 0; x < color->width; x++, shown += GSF__MINI_REFERENCE, frame += GSF__MINI_FRAME) {
             const int known = gsf__mini_shows(shown, r->desc.references, plane);
-            const float share = !known ? 0.0f : gsf__mini_confirms(shown, r->desc.references, plane) ? 1.0f : frame[3];
+            const float* out = known ? restored + 3 * x : frame;
             for (int64_t c = 0; c < 3; c++)
-                *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) =
-                    gsf__mini_clamp((1.0f - share) * frame[c] + share * restored[3 * x + c], 0.0f, 1.0f);
+                *(float*)(void*)(to + x * color->stride_x + c * color->stride_c) = gsf__mini_clamp(out[c], 0.0f, 1.0f);
             *(float*)(void*)(weight + x * confidence->stride_x) = known ? square / (square + expf(2.0f * error[x])) : 0.0f;
         }
     }

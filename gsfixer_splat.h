@@ -705,12 +705,13 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixe
 // The fixer's trainer, for rendering and export.
 GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
 // A filter on final renders: renders the trained splats for these cameras, all of the same size, and has the fixer's restorer
-// clean up the frames as one clip, with the photos that it has in the loop, and exposes them as the photos' camera would have
-// (gsf_fix_desc.auto_exposure). color, confidence: `count` f32 images of that size with 3 and 1 channels; the splats stay as
-// they are. More fixers than one are copies, trained on the same photos with other seeds, which err differently: the frames
-// become the mean of what the restorer makes of each copy's renders and, the more it makes these differ, that of the renders
-// themselves. They may share a restorer, which one fixer keeps begun until it trains or is destroyed, and several do not.
-// GSF_ERROR_INVALID_ARGUMENT without fixers, without a restorer or within a round.
+// clean up the frames as one clip, with the photos that it has in the loop. If that is a restorer of carried photos
+// (gsf_restorer_info.needs_carried), a frame changes only as far as the splats are opaque, and is exposed as the photos' camera
+// would have (gsf_fix_desc.auto_exposure). color, confidence: `count` f32 images of that size with 3 and 1 channels; the splats
+// stay as they are. More fixers than one are copies, trained on the same photos with other seeds, which err differently: frames
+// become the mean of what the restorer makes of each copy's renders, at any opacity, and, the more it makes these differ, that
+// of the renders themselves. They may share a restorer, which one fixer keeps begun until it trains or is destroyed, and
+// several do not. GSF_ERROR_INVALID_ARGUMENT without fixers, without a restorer or within a round.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* fixers, size_t fixer_count,
                                                          const gsf_camera* cameras, size_t count, gsf_image* color,
                                                          gsf_image* confidence);
@@ -15088,21 +15089,28 @@ static gsf_result gsf__render_views(gsf_context* ctx, const gsf_fixer* f, const 
     return GSF_OK;
 }
 
-// Exposes a restored frame as the photos' camera would have.
-static void gsf__expose_view(gsf_fixer* f, const gsf_camera* camera, const gsf_image* render, const gsf_image* alpha,
+// What becomes of a frame that was restored from carried photos: it is exposed as the photos' camera would have. Alone, without
+// copies that tell where the restorer errs, it stays the render as far as light passes the splats, since what carries photos
+// there is the depth of the few that stop light, often a wrong one. Measured in bench/TRIED.md
+static void gsf__finish_view(gsf_fixer* f, const gsf_camera* camera, const gsf_image* render, const gsf_image* alpha, int alone,
                              gsf_image* color) {
-    const float factor = gsf__carry_meter_frame(&f->carrier, camera, render, alpha, f->trainer->desc.render.background,
-                                                (double)f->desc.auto_exposure);
+    float factor = 1.0f;
+    if (f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0)
+        factor = gsf__carry_meter_frame(&f->carrier, camera, render, alpha, f->trainer->desc.render.background,
+                                        (double)f->desc.auto_exposure);
     for (int64_t y = 0; y < color->height; y++)
-        for (int64_t x = 0; x < color->width; x++)
+        for (int64_t x = 0; x < color->width; x++) {
+            const float share = alone ? gsf__get_pixel(alpha, x, y, 0) : 1.0f;
             for (int c = 0; c < 3; c++) {
-                const float value = factor * gsf__get_pixel(color, x, y, c);
+                const float restored = gsf__get_pixel(color, x, y, c);
+                const float value = factor * (share * restored + (1.0f - share) * gsf__get_pixel(render, x, y, c));
                 gsf__put_pixel(color, x, y, c, value < 1.0f ? value : 1.0f);
             }
+        }
 }
 
 // images: as of gsf__render_views.
-static gsf_result gsf__restore_views_of(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras, size_t count,
+static gsf_result gsf__restore_views_of(gsf_context* ctx, gsf_fixer* f, int alone, const gsf_camera* cameras, size_t count,
                                         const int32_t* known, gsf_image* images, gsf_image* color, gsf_image* confidence) {
     gsf_restore_window window;
     GSF__TRY(gsf__render_views(ctx, f, cameras, count, images));
@@ -15121,9 +15129,8 @@ static gsf_result gsf__restore_views_of(gsf_context* ctx, gsf_fixer* f, const gs
     window.out_confidence = confidence;
     gsf__lend_carrier(f, &window, images + count);
     GSF__TRY(gsf_restore_clip(ctx, f->restorer, &window));
-    const int exposed = f->limits.needs_carried > 0 && f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0;
-    for (size_t i = 0; i < count && exposed; i++)
-        gsf__expose_view(f, cameras + i, images + i, images + 2 * count + i, color + i);
+    for (size_t i = 0; i < count && f->limits.needs_carried > 0; i++)
+        gsf__finish_view(f, cameras + i, images + i, images + 2 * count + i, alone, color + i);
     return GSF_OK;
 }
 
@@ -15212,7 +15219,7 @@ GSF_API gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* f
     for (size_t i = 0; known && i < count; i++) known[i] = -1;
     for (size_t k = 0; k < fixer_count && pixels; k++) gsf__close_references(ctx, fixers[k]);
     for (size_t k = 0; k < fixer_count && result == GSF_OK; k++) {
-        result = gsf__restore_views_of(ctx, fixers[k], cameras, count, known, images, color, confidence);
+        result = gsf__restore_views_of(ctx, fixers[k], fixer_count == 1, cameras, count, known, images, color, confidence);
         for (size_t i = 0; i < count && pixels && result == GSF_OK; i++)
             gsf__add_copy(pixels + i * size, images + i, color + i, confidence + i, k + 1);
         for (size_t i = 0; i < 3 * count; i++) gsf_destroy_image(ctx, &images[i]);

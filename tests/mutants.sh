@@ -31,6 +31,7 @@ gsfixer_splat.h|test_rules|warp: what photos look through hides, too|s/if \(hidd
 gsfixer_splat.h|test_rules|warp: one of few photos that looks through makes a floater|s/\(few \? 2 : 1\)/1/
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/
 gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max_normal_angle = 40\.0f/d.max_normal_angle = 60.0f/
+gsfixer_splat.h|test_carry|filter: a view alone changes where light passes the splats, too|s/share = alone \? gsf__get_pixel\(alpha, x, y, 0\)/share = alone ? 1.0f/
 gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
 gsfixer_splat.h|test_stereo|dense points: coarse levels match grey|s/job->channels = level \? 3 : 1/job->channels = 1/
 gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/(basis\[10\] = gsf__v_set\()2\.890611442640554f/${1}-2.890611442640554f/
@@ -56,7 +57,6 @@ gsfixer_splat.h|test_fixer|joined copies: frames of their own splats|s/if \(f->d
 gsfixer_splat.h|test_fixer|joined copies: dropout goes on|s/d\.train\.dropout = 0\.0f;/;/
 gsfixer_splat.h|test_fixer|frames of warp are mixed in whatever their confidence|s/weight \* gsf__get_pixel\(f->warped_confidence \+ i, x, y, 0\)/weight/
 gsfixer_nn.h|test_nn_mini|mini: guesses are trained on where no photo shows anything|s/const int known = gsf__mini_shows\(shown, r->desc\.references, plane\)/const int known = 1/
-gsfixer_nn.h|test_nn_mini|mini: what no other photo confirms counts whole where light passes|s/plane\) \? 1\.0f : frame\[3\]/plane) ? 1.0f : 1.0f/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
 gsfixer_nn.h|test_nn_training|gradients: SiLU without its second term|s/return s \* \(1\.0 \+ x \* \(1\.0 - s\)\);/return s;/
 gsfixer_nn.h|test_nn_training|gradients: softmax as if its values were independent|s/(gsf__vf slope = gsf__v_load_first\(dy \+ i, left\)) - sum;/$1;/

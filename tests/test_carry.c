@@ -84,6 +84,7 @@ typedef struct probe {
     gsf_restorer restorer;
     const shots* c;
     int judges;              // compare with the truth
+    float add;               // to the colours of its frames
     uint64_t digest;         // of all that was carried
     int windows;
     // counts of pixels, over all frames and references: that the reference truly sees; of these, carried and verified; of the
@@ -186,6 +187,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
         CHECK_RESULT(ctx, w->carry_fn(w->carry_user, ctx, f, SLOTS, &none), GSF_ERROR_INVALID_ARGUMENT);
         CHECK_RESULT(ctx, w->carry_fn(w->carry_user, ctx, w->frame_count, 0, &none), GSF_ERROR_INVALID_ARGUMENT);
         CHECK_OK(ctx, gsf_convert_image(ctx, w->color + f, w->out_color + f));
+        for (int i = 0; i < 3 * camera->width * camera->height; i++) ((float*)w->out_color[f].data)[i] += p->add;
         memset(w->out_confidence[f].data, 0, (size_t)(camera->width * camera->height) * sizeof(float));
     }
     p->windows++;
@@ -326,6 +328,38 @@ static void test_metering(gsf_context* ctx, shots* c) {
     make_start(ctx, c);
 }
 
+// A final frame is what the restorer makes of it as far as the splats are opaque, and the render where light passes them; that
+// of copies is what the restorer makes of them.
+static void test_opacity(gsf_context* ctx, shots* c) {
+    static float color[3 * PIXELS], confidence[PIXELS], render[3 * PIXELS], alpha[PIXELS];
+    static probe p;
+    const gsf_camera camera = capture_camera(c, 12); // half of it nobody took
+    gsf_image frame = gsf_wrap_image(color, GSF_F32, WIDTH, HEIGHT, 3);
+    gsf_image sure = gsf_wrap_image(confidence, GSF_F32, WIDTH, HEIGHT, 1);
+    gsf_render_output out;
+    probe_init(&p, c, 0);
+    p.add = 0.125f;
+    gsf_fixer* fixer = make_fixer(ctx, c, &p, -1.0f);
+    if (!fixer || !finish(ctx, fixer)) return;
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, &fixer, 1, &camera, 1, &frame, &sure));
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(render, GSF_F32, WIDTH, HEIGHT, 3);
+    out.alpha = gsf_wrap_image(alpha, GSF_F32, WIDTH, HEIGHT, 1);
+    CHECK_OK(ctx, gsf_splat_render_trainer(ctx, gsf_splat_get_trainer(fixer), &camera, &out));
+    int thin = 0, opaque = 0;
+    for (int i = 0; i < PIXELS; i++) {
+        thin += alpha[i] < 0.25f;
+        opaque += alpha[i] > 0.75f;
+        for (int k = 3 * i; k < 3 * i + 3; k++)
+            CHECK_NEAR((double)color[k], fmin((double)(render[k] + alpha[i] * p.add), 1.0), 1e-6);
+    }
+    CHECK(thin > PIXELS / 10 && opaque > PIXELS / 10);
+    gsf_fixer* const copies[2] = {fixer, fixer}; // copies may change it everywhere
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, copies, 2, &camera, 1, &frame, &sure));
+    for (int k = 0; k < 3 * PIXELS; k++) CHECK_NEAR((double)color[k], fmin((double)(render[k] + p.add), 1.0), 1e-6);
+    gsf_splat_destroy_fixer(ctx, fixer);
+}
+
 static void test_mask(gsf_context* ctx, shots* c) {
     static uint8_t weight[PIXELS];
     static probe p, open;
@@ -432,6 +466,7 @@ int main(void) {
         test_same_bits(&ctx, &c, p.digest);
         test_exposure(&ctx, &c);
         test_metering(&ctx, &c);
+        test_opacity(&ctx, &c);
         test_mask(&ctx, &c);
         test_failing(&c);
     }

@@ -507,18 +507,6 @@ static void test_restorer(gsf_context* ctx) {
     run_restorer(ctx, &mini, &hidden, GSF_OK, 1);
     for (int i = 0; i < PIXELS; i++) CHECK_NEAR((double)hidden.weight[i], i == 2 ? 0.0 : weight, 1e-6); // nothing shows pixel 2
     for (int i = 0; i < PIXELS; i++) CHECK((memcmp(hidden.out + 3 * i, hidden.color + 3 * i, 12) == 0) == (i == 2));
-    for (int i = 0; i < 2; i++) { // the same but for pixel 5, which another photo just confirms, or just not
-        static clip sides[2];
-        sides[i] = c;
-        sides[i].alpha[5] = 0.25f;
-        sides[i].carried[9 * PIXELS + 5] = i ? 0.49999f : 0.5f;
-        run_restorer(ctx, &mini, &sides[i], GSF_OK, 1);
-        for (int k = 15; i && k < 18; k++) {
-            const double change = (double)(sides[0].out[k] - c.color[k]);
-            CHECK(fabs(change) > 1e-4);
-            CHECK_NEAR((double)(sides[1].out[k] - c.color[k]), 0.25 * change, 1e-6);
-        }
-    }
     run_restorer(ctx, &mini, &c, GSF_ERROR_UNSUPPORTED, 0);
     gsf_destroy_restorer(ctx, &mini);
     CHECK_OK(ctx, gsf_read_file(ctx, made_path(), &bytes, &size));
