@@ -706,12 +706,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixe
 GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
 // A filter on final renders: renders the trained splats for these cameras, all of the same size, and has the fixer's restorer
 // clean up the frames as one clip, with the photos that it has in the loop. If that is a restorer of carried photos
-// (gsf_restorer_info.needs_carried), a frame changes only as far as the splats are opaque, and is exposed as the photos' camera
-// would have (gsf_fix_desc.auto_exposure). color, confidence: `count` f32 images of that size with 3 and 1 channels; the splats
-// stay as they are. More fixers than one are copies, trained on the same photos with other seeds, which err differently: frames
-// become the mean of what the restorer makes of each copy's renders, at any opacity, and, the more it makes these differ, that
-// of the renders themselves. They may share a restorer, which one fixer keeps begun until it trains or is destroyed, and
-// several do not. GSF_ERROR_INVALID_ARGUMENT without fixers, without a restorer or within a round.
+// (gsf_restorer_info.needs_carried), a frame is exposed as the photos' camera would have (gsf_fix_desc.auto_exposure) and, with
+// fewer than six photos, changes only as far as the splats are opaque. color, confidence: `count` f32 images of that size with
+// 3 and 1 channels; the splats stay as they are. More fixers than one are copies, trained on the same photos with other seeds,
+// which err differently: frames become the mean of what the restorer makes of each copy's renders, at any opacity, and, the
+// more it makes these differ, that of the renders themselves. They may share a restorer, which one fixer keeps begun until it
+// trains or is destroyed, and several do not. GSF_ERROR_INVALID_ARGUMENT without fixers, without a restorer or within a round.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_restore_views(gsf_context* ctx, gsf_fixer* const* fixers, size_t fixer_count,
                                                          const gsf_camera* cameras, size_t count, gsf_image* color,
                                                          gsf_image* confidence);
@@ -15090,17 +15090,18 @@ static gsf_result gsf__render_views(gsf_context* ctx, const gsf_fixer* f, const 
 }
 
 // What becomes of a frame that was restored from carried photos: it is exposed as the photos' camera would have. Alone, without
-// copies that tell where the restorer errs, it stays the render as far as light passes the splats, since what carries photos
-// there is the depth of the few that stop light, often a wrong one. Measured in bench/TRIED.md
+// copies that tell where the restorer errs, and with few photos it stays the render as far as light passes the splats, since
+// what carries photos there is the depth of the few that stop light, often a wrong one. Measured in bench/TRIED.md
 static void gsf__finish_view(gsf_fixer* f, const gsf_camera* camera, const gsf_image* render, const gsf_image* alpha, int alone,
                              gsf_image* color) {
+    const int by_opacity = alone && f->view_count < GSF__WARP_FEW;
     float factor = 1.0f;
     if (f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0)
         factor = gsf__carry_meter_frame(&f->carrier, camera, render, alpha, f->trainer->desc.render.background,
                                         (double)f->desc.auto_exposure);
     for (int64_t y = 0; y < color->height; y++)
         for (int64_t x = 0; x < color->width; x++) {
-            const float share = alone ? gsf__get_pixel(alpha, x, y, 0) : 1.0f;
+            const float share = by_opacity ? gsf__get_pixel(alpha, x, y, 0) : 1.0f;
             for (int c = 0; c < 3; c++) {
                 const float restored = gsf__get_pixel(color, x, y, c);
                 const float value = factor * (share * restored + (1.0f - share) * gsf__get_pixel(render, x, y, c));

@@ -31,7 +31,7 @@ gsfixer_splat.h|test_rules|warp: what photos look through hides, too|s/if \(hidd
 gsfixer_splat.h|test_rules|warp: one of few photos that looks through makes a floater|s/\(few \? 2 : 1\)/1/
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/
 gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max_normal_angle = 40\.0f/d.max_normal_angle = 60.0f/
-gsfixer_splat.h|test_carry|filter: a view alone changes where light passes the splats, too|s/share = alone \? gsf__get_pixel\(alpha, x, y, 0\)/share = alone ? 1.0f/
+gsfixer_splat.h|test_carry|filter: a view alone changes where light passes the splats, too|s/share = by_opacity \? gsf__get_pixel\(alpha, x, y, 0\)/share = by_opacity ? 1.0f/
 gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
 gsfixer_splat.h|test_stereo|dense points: coarse levels match grey|s/job->channels = level \? 3 : 1/job->channels = 1/
 gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/(basis\[10\] = gsf__v_set\()2\.890611442640554f/${1}-2.890611442640554f/

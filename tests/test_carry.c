@@ -85,6 +85,7 @@ typedef struct probe {
     const shots* c;
     int judges;              // compare with the truth
     float add;               // to the colours of its frames
+    int32_t photos;
     uint64_t digest;         // of all that was carried
     int windows;
     // counts of pixels, over all frames and references: that the reference truly sees; of these, carried and verified; of the
@@ -102,8 +103,8 @@ static gsf_result probe_query(void* user, gsf_context* ctx, int32_t frames, int3
     return GSF_OK;
 }
 static gsf_result probe_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
-    (void)user, (void)ctx, (void)references;
-    CHECK(count == VIEWS);
+    (void)ctx, (void)references;
+    CHECK(count == ((const probe*)user)->photos);
     return GSF_OK;
 }
 static void probe_end(void* user, gsf_context* ctx) { (void)user, (void)ctx; }
@@ -180,7 +181,7 @@ static gsf_result probe_restore(void* user, gsf_context* ctx, const gsf_restore_
                       images[i]->dtype == GSF_F32 && images[i]->channels == (i < 2 || i == 5 ? 3 : 1));
                 digest(p, images[i]);
             }
-            CHECK(k.reference >= 0 && k.reference < VIEWS);
+            CHECK(k.reference >= 0 && k.reference < p->photos);
             if (p->judges) judge(p, camera, &k, truth, depth);
         }
         gsf_carried none;
@@ -200,6 +201,7 @@ static void probe_init(probe* p, const shots* c, int judges) {
     p->restorer = restorer;
     p->c = c;
     p->judges = judges;
+    p->photos = VIEWS;
     p->digest = 14695981039346656037u;
 }
 
@@ -328,35 +330,50 @@ static void test_metering(gsf_context* ctx, shots* c) {
     make_start(ctx, c);
 }
 
-// A final frame is what the restorer makes of it as far as the splats are opaque, and the render where light passes them; that
-// of copies is what the restorer makes of them.
-static void test_opacity(gsf_context* ctx, shots* c) {
+// The final frame at a camera, of a fixer or of copies: the render and what the restorer adds to it, as far as the splats are
+// opaque if `by_opacity` is set.
+static void filter_frame(gsf_context* ctx, gsf_fixer* const* fixers, size_t count, const gsf_camera* camera, float add,
+                         int by_opacity) {
     static float color[3 * PIXELS], confidence[PIXELS], render[3 * PIXELS], alpha[PIXELS];
-    static probe p;
-    const gsf_camera camera = capture_camera(c, 12); // half of it nobody took
     gsf_image frame = gsf_wrap_image(color, GSF_F32, WIDTH, HEIGHT, 3);
     gsf_image sure = gsf_wrap_image(confidence, GSF_F32, WIDTH, HEIGHT, 1);
     gsf_render_output out;
-    probe_init(&p, c, 0);
-    p.add = 0.125f;
-    gsf_fixer* fixer = make_fixer(ctx, c, &p, -1.0f);
-    if (!fixer || !finish(ctx, fixer)) return;
-    CHECK_OK(ctx, gsf_splat_restore_views(ctx, &fixer, 1, &camera, 1, &frame, &sure));
+    CHECK_OK(ctx, gsf_splat_restore_views(ctx, fixers, count, camera, 1, &frame, &sure));
     memset(&out, 0, sizeof out);
     out.color = gsf_wrap_image(render, GSF_F32, WIDTH, HEIGHT, 3);
     out.alpha = gsf_wrap_image(alpha, GSF_F32, WIDTH, HEIGHT, 1);
-    CHECK_OK(ctx, gsf_splat_render_trainer(ctx, gsf_splat_get_trainer(fixer), &camera, &out));
+    CHECK_OK(ctx, gsf_splat_render_trainer(ctx, gsf_splat_get_trainer(fixers[0]), camera, &out));
     int thin = 0, opaque = 0;
     for (int i = 0; i < PIXELS; i++) {
         thin += alpha[i] < 0.25f;
         opaque += alpha[i] > 0.75f;
         for (int k = 3 * i; k < 3 * i + 3; k++)
-            CHECK_NEAR((double)color[k], fmin((double)(render[k] + alpha[i] * p.add), 1.0), 1e-6);
+            CHECK_NEAR((double)color[k], fmin((double)(render[k] + (by_opacity ? alpha[i] : 1.0f) * add), 1.0), 1e-6);
     }
     CHECK(thin > PIXELS / 10 && opaque > PIXELS / 10);
-    gsf_fixer* const copies[2] = {fixer, fixer}; // copies may change it everywhere
-    CHECK_OK(ctx, gsf_splat_restore_views(ctx, copies, 2, &camera, 1, &frame, &sure));
-    for (int k = 0; k < 3 * PIXELS; k++) CHECK_NEAR((double)color[k], fmin((double)(render[k] + p.add), 1.0), 1e-6);
+}
+
+// A final frame of few photos changes as far as the splats are opaque; that of copies or of more photos changes everywhere.
+static void test_opacity(gsf_context* ctx, shots* c) {
+    static probe p;
+    const gsf_camera camera = capture_camera(c, 12); // half of it nobody took
+    gsf_train_view twice[2 * VIEWS];
+    probe_init(&p, c, 0);
+    p.add = 0.125f;
+    gsf_fixer* fixer = make_fixer(ctx, c, &p, -1.0f);
+    if (!fixer || !finish(ctx, fixer)) return;
+    gsf_fixer* const copies[2] = {fixer, fixer};
+    filter_frame(ctx, copies, 1, &camera, p.add, 1);
+    filter_frame(ctx, copies, 2, &camera, p.add, 0);
+    gsf_fix_desc desc = gsf_splat_get_fixer_desc(fixer);
+    gsf_splat_destroy_fixer(ctx, fixer);
+    for (int i = 0; i < 2 * VIEWS; i++) twice[i] = c->views[i % VIEWS];
+    p.photos = 2 * VIEWS;
+    desc.auto_exposure = -1.0f;
+    desc.path = &camera; // cameras in pairs have none
+    desc.path_count = 1;
+    if (!CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, twice, 2 * VIEWS, &c->start, &p.restorer, &fixer))) return;
+    filter_frame(ctx, &fixer, 1, &camera, p.add, 0);
     gsf_splat_destroy_fixer(ctx, fixer);
 }
 
