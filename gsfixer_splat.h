@@ -15094,9 +15094,11 @@ static gsf_result gsf__render_views(gsf_context* ctx, const gsf_fixer* f, const 
 // what carries photos there is the depth of the few that stop light, often a wrong one. Measured in bench/TRIED.md
 static void gsf__finish_view(gsf_fixer* f, const gsf_camera* camera, const gsf_image* render, const gsf_image* alpha, int alone,
                              gsf_image* color) {
+    const int exposed = f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0;
     const int by_opacity = alone && f->view_count < GSF__WARP_FEW;
     float factor = 1.0f;
-    if (f->desc.auto_exposure > 0.0f && f->carrier.automatic > 0.0)
+    if (!exposed && !by_opacity) return;
+    if (exposed)
         factor = gsf__carry_meter_frame(&f->carrier, camera, render, alpha, f->trainer->desc.render.background,
                                         (double)f->desc.auto_exposure);
     for (int64_t y = 0; y < color->height; y++)

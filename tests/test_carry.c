@@ -347,8 +347,10 @@ static void filter_frame(gsf_context* ctx, gsf_fixer* const* fixers, size_t coun
     for (int i = 0; i < PIXELS; i++) {
         thin += alpha[i] < 0.25f;
         opaque += alpha[i] > 0.75f;
-        for (int k = 3 * i; k < 3 * i + 3; k++)
-            CHECK_NEAR((double)color[k], fmin((double)(render[k] + (by_opacity ? alpha[i] : 1.0f) * add), 1.0), 1e-6);
+        for (int k = 3 * i; k < 3 * i + 3; k++) {
+            const double expected = (double)(render[k] + (by_opacity ? alpha[i] : 1.0f) * add);
+            CHECK_NEAR((double)color[k], by_opacity ? fmin(expected, 1.0) : expected, 1e-6);
+        }
     }
     CHECK(thin > PIXELS / 10 && opaque > PIXELS / 10);
 }
